@@ -45,10 +45,12 @@ import numpy as np
 from off_map import extractor
 from off_map_page import HYBRID, KINDS
 from results import environment, heading, options_parser, ROOT, table, write_lines
+from stavpr_lab.style import DASHES, legend_above, page
 from stavpr_ros.features import registry
 from stavpr_ros.method import error_rate
 from stavpr_ros.method.evidence import log_odds
 from stavpr_ros.method.localizer import EARLY
+from stavpr_ros.palette import INK, SKY, VERMILION
 
 # ------------------------------------------------ page
 
@@ -98,39 +100,29 @@ def constants_section(every: Sequence[Windows], values: Values) -> list[str]:
 
 
 def draw(risks: Risks, path: Path) -> None:
-    """Draw ordered against achieved rates, one mark for each drive, left out, with intervals."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 4), layout='constrained')
-    FigureCanvasAgg(figure)
-    axes, on = figure.subplots(1, 2, sharey=True), np.array([bool(d.truth) for d in risks.drives])
-    errors, means = error_rate.ERRORS, np.full((2, len(error_rate.ERRORS)), np.nan)
-    for k, error in enumerate(errors):
-        wrong, matched = count_matches(risks, error)
-        low, high = wilson(wrong, matched)
-        for side, rows in enumerate((on & (matched > 0), ~on & (matched > 0))):
-            if not rows.any():
-                continue
-            rate = wrong[rows] / matched[rows]
-            order = np.argsort(rate)
-            x = error * np.exp(np.linspace(-0.17, 0.17, len(order)))
-            bars = {'color': '#7fa8dc', 'lw': 0.5, 'alpha': 0.5}
-            axes[side].vlines(x, low[rows][order], high[rows][order], **bars)
-            axes[side].plot(x, rate[order], '.', color='#2358a5', ms=2)
-            means[side, k] = rate.mean()
-    for panel, title, mean in zip(axes, ('on the map', 'off the map'), means, strict=True):
-        panel.plot(errors, errors, ':', color='#6b7078', label='as ordered')
-        panel.plot(errors, mean, 'D', color='#c8402f', ms=5, label='mean of the drives')
-        panel.set(xscale='log', xlabel='max_error', title=f'drives {title}', ylim=(-0.005, 1))
-        panel.set_yscale('symlog', linthresh=0.01)
-        panel.set_xticks(errors, [f'{error:g}' for error in errors], minor=False)
-        panel.minorticks_off()
-        panel.legend(fontsize=8, loc='upper left')
-    axes[0].set_ylabel('wrong of matched')
-    axes[1].set_ylabel('matched of all')
+    """Draw ordered against achieved rates, one dot for each drive, left out, and their means."""
+    on, errors = np.array([bool(d.truth) for d in risks.drives]), error_rate.ERRORS
+    sides = ((on, 'on', 'wrong of the matches'), (~on, 'off', 'matched of all images'))
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    with page(path, 11, 5) as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, (rows, side, what) in zip(panels, sides, strict=True):
+            means = []
+            for error in errors:
+                wrong, matched = (counts[rows] for counts in count_matches(risks, error))
+                rates = np.sort(wrong[matched > 0] / matched[matched > 0])
+                x = error * np.exp(np.linspace(-0.17, 0.17, len(rates)))
+                axes.plot(x, rates, '.', color=SKY, ms=4, label='' if means else 'a drive')
+                means.append(rates.mean())
+            axes.plot(errors, errors, color=INK, ls=DASHES, label='as ordered')
+            axes.plot(errors, means, 'D', color=VERMILION, ms=8, label='mean of the drives')
+            axes.set(xscale='log', xlabel='ordered rate, max_error (share)', ylim=(-0.0007, 1))
+            axes.set_yscale('symlog', linthresh=0.01)
+            axes.set_xticks(errors, [f'{error:g}' for error in errors], minor=False)
+            axes.set_yticks(*[(0, 0.005, 0.01, 0.1, 1)] * 2)
+            axes.minorticks_off()
+            axes.set_ylabel(f'drives {side} the map: {what} (share)')
+            legend_above(axes, 3)
 
 
 def errors_section(every: Sequence[Windows], values: Values, draws: bool) -> list[str]:

@@ -15,13 +15,13 @@ from stavpr_lab.demonstration.plots import demo_sheet
 from stavpr_lab.evaluation.metrics import ImageMatches
 from stavpr_lab.evaluation.plots import drive, MatchPair, reduced_matrix
 from stavpr_lab.evaluation.records import TraverseEvaluation
+from stavpr_ros import palette
 from stavpr_ros.mapping import save_map
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
 
 QUERIES, PLACES, THRESHOLD = 40, 30, 0.5
-GREEN, RED, AMBER, GRAY = (46, 139, 87), (200, 64, 47), (217, 154, 28), (138, 143, 152)
-BRIGHT_GREEN, BRIGHT_RED = (53, 208, 127), (255, 84, 64)
-YELLOW, BLUE = (240, 196, 25), (59, 110, 165)
+COLORS = 'BLUE', 'VERMILION', 'SKY', 'ORANGE', 'GRAY', 'YELLOW'
+BLUE, RED, SKY, AMBER, GRAY, YELLOW = (palette.rgb(getattr(palette, name)) for name in COLORS)
 
 
 @pytest.fixture(scope='module')
@@ -75,7 +75,7 @@ def test_reduced_matrix_returns_where_its_axes_are(path):
     truth = np.eye(20, 30, dtype=bool)
     matches = {'right': np.array([[100, 200]]), 'wrong': np.array([[300, 50]])}
     left, top, width, height = reduced_matrix(path, values, (400, 600), truth, matches)
-    assert all(colors_of(path, BRIGHT_GREEN, BRIGHT_RED, YELLOW))
+    assert all(colors_of(path, BLUE, RED, YELLOW))
     plot = cv2.imread(str(path))[:, :, ::-1].astype(int)
 
     def around(query, place):
@@ -83,17 +83,16 @@ def test_reduced_matrix_returns_where_its_axes_are(path):
         column = round(plot.shape[1] * (left + width * (place + 0.5) / 600))
         return plot[row - 2 : row + 3, column - 2 : column + 3]
 
-    assert np.abs(around(100, 200) - BRIGHT_GREEN).max(axis=2).min() < 12
-    assert np.abs(around(300, 50) - BRIGHT_RED).max(axis=2).min() < 12
+    assert np.abs(around(100, 200) - BLUE).max(axis=2).min() < 12
+    assert np.abs(around(300, 50) - RED).max(axis=2).min() < 12
 
 
 def test_demo_sheet_shows_matches_and_ground_truth_as_far_as_known(path, results):
     distances, result = results
-    bright = BRIGHT_GREEN, BRIGHT_RED, YELLOW
     demo_sheet(path, pairs(), distances, result, THRESHOLD, 'Title')
-    assert all(colors_of(path, GREEN, RED, AMBER, GRAY, BLUE, *bright, least=(1000, 1500)))
+    assert all(colors_of(path, BLUE, RED, AMBER, GRAY, YELLOW, least=(1000, 1500)))
     demo_sheet(path, [], distances, replace(result, true_places=None), THRESHOLD, 'Title')
-    assert colors_of(path, (79, 179, 255), *bright) == [True, False, False, False]
+    assert colors_of(path, SKY, BLUE, RED, YELLOW) == [True, False, False, False]
 
 
 def test_drive_shows_outcomes_true_places_and_unseen_images(path):
@@ -101,7 +100,7 @@ def test_drive_shows_outcomes_true_places_and_unseen_images(path):
     outcomes = np.repeat(['right', 'wrong', 'no match', 'unseen'], 10)
     truth = np.stack([queries, queries], axis=1)[:30]
     drive(path, truth, 50, np.where(outcomes == 'wrong', 45, queries), outcomes, queries >= 30)
-    assert all(colors_of(path, GREEN, RED, AMBER, GRAY, YELLOW, (233, 233, 228)))
+    assert all(colors_of(path, BLUE, RED, AMBER, GRAY, YELLOW, (233, 233, 228)))
     drive(path, truth[:0], 50, queries, outcomes, queries < 0)
     assert colors_of(path, YELLOW) == [False]
 

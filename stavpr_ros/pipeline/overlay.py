@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.method import Match
+from stavpr_ros.palette import BLUE, INK, ORANGE, PAPER, rgb
 from stavpr_ros.pipeline.result import ImageResult
 
-RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
+RIGHT, NO_MATCH = rgb(BLUE), rgb(ORANGE)
 NEARBY = 150  # places shown to each side of a match
 SIZE = (900, 240)  # pixels of the drawn distances, about
-_INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
+_INK, _PAPER, _EMPTY = rgb(INK), rgb(PAPER), (226, 226, 222)
 
 
 def draw_match(result: ImageResult, places: Map | GrowingMap | None) -> np.ndarray:
@@ -104,14 +105,14 @@ def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
         for f in (np.nanmin, np.nanmax)
     )
     gray = np.nan_to_num((finite - low) / max(high - low, 1e-9), nan=1.0) * 255
-    sheet = cv2.applyColorMap(gray.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
-    sheet = np.ascontiguousarray(np.repeat(np.repeat(sheet, down, axis=0), across, axis=1))
+    sheet = cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    sheet = sheet.repeat(down, axis=0).repeat(across, axis=1)
     if len(match.path.pairs):
         points = [
             ((place - first) * across + across // 2, image * down + down // 2)
             for image, place in match.path.pairs.tolist()
         ]
-        ink = (255, 255, 255) if match.accepted else NO_MATCH
+        ink = RIGHT if match.accepted else NO_MATCH
         cv2.polylines(sheet, [np.array(points, np.int32)], False, ink, 2, cv2.LINE_AA)
     bar = np.full((24, sheet.shape[1], 3), _PAPER, np.uint8)
     text = f'images of the window (newest below) x places {first} to {first + width - 1}'

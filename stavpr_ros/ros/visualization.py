@@ -17,6 +17,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.palette import BLUE, GRAY, rgb, VERMILION
 from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.pipeline.overlay import column_minima, draw_match, draw_window, places_to_draw
 from stavpr_ros.ros.messages import image_message, Outcome, Places, pose_message
@@ -204,10 +205,11 @@ class Visualization(Publishers):
 
 
 def color(probability: float) -> ColorRGBA:
-    """Return the color of a probability, red = 0 to green = 1; blue = unknown."""
-    if math.isnan(probability):
-        return ColorRGBA(r=0.2, g=0.4, b=1.0, a=0.9)
-    return ColorRGBA(r=1 - probability, g=probability, b=0.1, a=0.9)
+    """Return the color of a probability, vermilion = 0 to blue = 1; gray = unknown."""
+    ends = (GRAY, GRAY) if math.isnan(probability) else (VERMILION, BLUE)
+    low, high = (np.array(rgb(end)) / 255 for end in ends)
+    red, green, blue = (low + np.nan_to_num(probability) * (high - low)).tolist()
+    return ColorRGBA(r=red, g=green, b=blue, a=0.9)
 
 
 def _point(pose: np.ndarray) -> Point:

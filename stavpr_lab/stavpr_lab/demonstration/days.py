@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 import sys
 
-import matplotlib as mpl
 import numpy as np
 from stavpr_lab.demonstration import FEATURES
 from stavpr_lab.demonstration.street.days import DAY, Days
 from stavpr_lab.demonstration.street.traverses import EPOCH
+from stavpr_lab.style import legend_above, page
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.upkeep import update_map
@@ -29,6 +29,7 @@ TOLERANCE = 8.0  # meters from the right position
 DETOUR = -1000.0  # meters, of positions in the detour
 MAPS = ('first session', 'updated map', 'updated map in int8')
 PRECISIONS = 'float32', 'float32', 'int8'  # of MAPS
+LINES = '-o', '-', '--'  # of MAPS
 
 
 @dataclass(frozen=True)
@@ -122,28 +123,21 @@ def table(results: list[Day]) -> str:
 
 def plot(results: list[Day], path: Path) -> None:
     """Draw recall and places by day."""
-    mpl.use('Agg')
-    from matplotlib import pyplot as plt
-
-    figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True)
     numbers = [day.number for day in results]
-    for i, name in enumerate(MAPS):
-        above.plot(numbers, [day.recall[i] for day in results], label=name)
-        below.plot(numbers, [day.places[i] for day in results], label=name)
-    above.set_ylabel('recall')
-    below.set_ylabel('places')
-    below.set_yscale('log')
-    below.set_xlabel('day')
-    above.legend()
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with page(path, 9, 6) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        for i, (name, line) in enumerate(zip(MAPS, LINES, strict=True)):
+            above.plot(numbers, [day.recall[i] for day in results], line, label=name)
+            below.plot(numbers, [day.places[i] for day in results], line)
+        above.set_ylabel('recall (share of the images)')
+        below.set(xlabel='day (number)', ylabel='places (number)', ylim=(0, None))
+        legend_above(above, 3)
 
 
 def main() -> None:
     """Run the days, and write table and plot with each of them."""
     count, target = int(sys.argv[1]), Path(sys.argv[2])
-    page, results = target.with_suffix('.md'), []
+    file, results = target.with_suffix('.md'), []
     text = f"""# Days
 
 Written by `python3 -m stavpr_lab.demonstration.days {' '.join(sys.argv[1:])}` (`make
@@ -154,7 +148,7 @@ days`). The images of a day are matched before the map learns from them.
     days = Days(int(sys.argv[3])) if sys.argv[3:] else Days()
     for day in run(days, count):
         results.append(day)
-        page.write_text(f'{text}\n{table(results)}\n')
+        file.write_text(f'{text}\n{table(results)}\n')
         plot(results, target.with_suffix('.png'))
 
 

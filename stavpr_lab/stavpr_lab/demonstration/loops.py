@@ -13,9 +13,11 @@ from stavpr_lab.evaluation import plots
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.plots import MatchPair, Outcome
 from stavpr_lab.evaluation.records import IN_WINDOW
+from stavpr_lab.style import legend_above, show_distances, titled_page
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.palette import QUIET
 from stavpr_ros.prepare.centering import evenly
 
 MAX_PAIRS = 8  # pairs of images
@@ -28,20 +30,22 @@ class LoopResult:
     The loop closures of N images, in numbers of images.
 
     :param closures: (query, place) of each, shape (C, 2).
-    :param distances: distance of each, shape (C,).
+    :param amounts: probability of each, in mode paper its distance, shape (C,).
     :param pairs: (later, earlier) images aligned by a closure, each once, shape (M, 2).
     :param ground_truth: None = unknown.
     :param exclude: latest places that an image was not compared with.
     :param skipped: images too similar to the last keyframe.
+    :param quantity: what ``amounts`` are, 'probability' or 'distance'.
     """
 
     N: int
     closures: np.ndarray
-    distances: np.ndarray
+    amounts: np.ndarray
     pairs: np.ndarray
     ground_truth: GroundTruth | None
     exclude: int
     skipped: int
+    quantity: str
 
     def are_correct(self, pairs: np.ndarray) -> np.ndarray | None:
         """Return which pairs of images (M, 2) are correct, shape (M,), bool; None = unknown."""
@@ -85,6 +89,8 @@ def read_result(
     """
     in_window = [i for i, match in enumerate(matches) if match['status'] in IN_WINDOW]
     images = np.array(in_window, np.int64)
+    is_paper = closures and closures[0]['probability'] is None
+    quantity = 'distance' if is_paper else 'probability'
     ends = [[closure['query_index'], closure['place_index']] for closure in closures]
     pairs = [
         [pair['query_index'], pair['place_index']]
@@ -94,11 +100,12 @@ def read_result(
     return LoopResult(
         len(matches),
         images[np.array(ends, np.int64).reshape(-1, 2)],
-        np.array([closure['distance'] for closure in closures], float),
+        np.array([closure[quantity] for closure in closures], float),
         images[np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)],
         ground_truth,
         exclude,
         sum(match['status'] == 'SKIPPED' for match in matches),
+        quantity,
     )
 
 
@@ -127,7 +134,7 @@ def _pairs(result: LoopResult, place_map: Map) -> list[MatchPair]:
         image = place_map.thumbnail(query)
         if image is None:
             raise InputError('the map of the traverse has no thumbnails')
-        caption = f'query image {query}: place {place}, distance {result.distances[i]:.2f}'
+        caption = f'image {query}: place {place}, {result.quantity} {result.amounts[i]:.2f}'
         pairs.append(MatchPair(image, place_map.thumbnail(place), caption, outcome))
     return pairs
 
@@ -148,13 +155,10 @@ def _draw_traverse(
     """Draw the compared pairs, the ground truth, and the aligned pairs."""
     N = result.N
     if distances is not None:
-        plots.show_distances(figure, axes, distances, aspect='auto')
-    size = float(np.clip(900 / N, 2.5, 5.0))
-    dots: dict[str, Any] = {'marker': '.', 'linestyle': 'none', 'mew': 0}
+        show_distances(figure, axes, distances, aspect='auto')
     if result.ground_truth is not None:
         later, earlier = result.ground_truth.pairs.T
-        style: dict[str, Any] = {'color': plots.TRUTH, 'ms': size * 2.4, 'alpha': 0.4}
-        axes.plot(earlier, later, label='passed before', **style, **dots)
+        axes.plot(earlier, later, 'o', color=plots.TRUTH, ms=5, mew=0, label='passed before')
     correct = result.are_correct(result.pairs)
     if correct is None:
         masks = {'match': np.ones(len(result.pairs), bool)}
@@ -163,28 +167,29 @@ def _draw_traverse(
     for outcome, mask in masks.items():
         if mask.any():
             later, earlier = result.pairs[mask].T
-            label = plots.MEANING[outcome].replace('match', 'aligned')
-            axes.plot(earlier, later, color=plots.BRIGHT[outcome], ms=size, label=label, **dots)
+            label = plots.MARKS[outcome]['label'].replace('match', 'aligned')
+            mark = plots.MARKS[outcome] | {'label': label}
+            axes.plot(earlier, later, ls='none', mew=0, **mark)
     note = 'not compared:\nlater, or too recent'
-    axes.text(N * 0.97, N * 0.04, note, ha='right', va='top', color=plots.QUIET)
-    axes.set(xlabel='place: earlier image', ylabel='query image')
+    axes.text(N * 0.97, N * 0.04, note, ha='right', va='top', color=QUIET)
+    axes.set(xlabel='place: earlier image (number)', ylabel=plots.QUERY)
     axes.set(xlim=(-0.5, N - 0.5), ylim=(N - 0.5, -0.5))
-    for handle in plots.legend_above(axes, 3).get_lines():
-        handle.set(markersize=10, alpha=1)
+    legend_above(axes, 3)
 
 
 def draw_loops(result: LoopResult, place_map: Map, title: str, folder: Path) -> Path:
     """
-    Draw the page ``loop.png``: the traverse against its own past, and closures.
+    Draw the page ``loop.png``: closures, and the traverse against its own past.
 
     :param place_map: a map of all images, with thumbnails.
     :returns: its path.
     """
     path = folder / 'loop.png'
     pairs = 'Pairs: query image on the left, its place (an earlier image) on the right'
-    with plots.titled_page(path, 12.5, 5.9, title, f'{result.summary()}\n{pairs}') as figure:
-        halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.1))
+    with titled_page(path, 12.5, 5.9, title, f'{result.summary()}\n{pairs}') as figure:
+        halves: Any = figure.subfigures(1, 2, width_ratios=(1.1, 1))
         left, right = halves
-        _draw_traverse(left, left.add_subplot(), result, _compared_distances(result, place_map))
-        plots.draw_pairs(right, _pairs(result, place_map), 2)
+        plots.draw_pairs(left, _pairs(result, place_map), 2)
+        distances = _compared_distances(result, place_map)
+        _draw_traverse(right, right.add_subplot(), result, distances)
     return path

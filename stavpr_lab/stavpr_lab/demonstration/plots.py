@@ -1,8 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a localization demonstration: images, the distance matrix, distances over time."""
+"""The page of a localization demonstration: images, places, and probabilities over time."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 import numpy as np
 from stavpr_lab.evaluation import plots
-from stavpr_lab.evaluation.plots import COLORS, MatchPair, MEANING, Outcome
+from stavpr_lab.evaluation.plots import MARKS, MatchPair, Outcome
 from stavpr_lab.evaluation.records import TraverseEvaluation
+from stavpr_lab.style import DASHES, legend_above, titled_page
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.palette import GRID, INK, PAPER
 
 MAX_PAIRS = 6  # pairs of images: two rows of three
 
@@ -63,11 +66,11 @@ def _pair(
     left = query.thumbnail(image)
     if left is None:
         raise InputError('the map of the query has no thumbnails')
-    place, distance = int(result.matched[image]), result.matches.distances[image]
+    place, amount = int(result.matched[image]), result.amount(result.matches.distances[image])
     match = f'place {place}' if place >= 0 else 'no match'
-    text = f'{match}, distance {distance:.3f}' if np.isfinite(distance) else 'no window'
+    text = f'{match}, {result.quantity} {amount:.2f}' if np.isfinite(amount) else 'no window'
     right = place_map.thumbnail(place) if place >= 0 else None
-    return MatchPair(left, right, f'query image {image}: {text}', outcome)
+    return MatchPair(left, right, f'image {image}: {text}', outcome)
 
 
 def demo_sheet(
@@ -79,13 +82,14 @@ def demo_sheet(
     title: str,
 ) -> None:
     """
-    Draw one page: pairs above, the matrix and the distance over time below.
+    Draw one page: pairs above, the matrix and the probability over time below.
 
     :param distances: every query to every place, shape (N, n).
     """
-    above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
-    summary = f'{result.summary()}\nPairs: query image on the left, matched place on the right'
-    with plots.titled_page(path, 11, above + below, title, summary) as figure:
+    above, below = 0.5 + 1.55 * max(1, -(-len(pairs) // 3)), 4.2
+    timeless = replace(result, seconds=result.seconds[:0])  # times are of one machine
+    summary = f'{timeless.summary()}\nPairs: query image on the left, matched place on the right'
+    with titled_page(path, 11, above + below, title, summary) as figure:
         rows: Any = figure.subfigures(2, 1, height_ratios=(above, below))
         top, bottom = rows
         left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.18))
@@ -108,27 +112,25 @@ def _draw_matrix(figure: SubFigure, distances: np.ndarray, result: TraverseEvalu
     label = f'true place ± {result.tolerance}'
     plots.draw_matrix(figure, axes, distances, distances.shape, cells, label, matches)
     for start, stop in plots.runs(truth < 0):
-        axes.axhspan(start - 0.5, stop - 0.5, color=plots.PAPER, alpha=0.32, lw=0)
+        axes.axhspan(start - 0.5, stop - 0.5, color=PAPER, alpha=0.5, lw=0)
         if stop - start > len(truth) / 25:
             at = distances.shape[1] * 0.02, (start + stop - 1) / 2
-            axes.text(*at, 'not in the map', va='center', color=plots.INK, fontsize=9.5)
+            axes.text(*at, 'not in the map', va='center', color=INK)
 
 
 def _draw_time(axes: Axes, result: TraverseEvaluation, threshold: float) -> None:
-    """Draw the distance of each query's best match as a dot in the color of its outcome."""
-    distances, kinds = result.matches.distances, outcomes_of(result)
-    index = np.arange(len(distances))
-    axes.plot(index, distances, color=plots.GRID, lw=1.0, zorder=1)
-    for outcome, color in COLORS.items():
+    """Draw the probability, or distance, of each query's best match as a mark of its outcome."""
+    amounts, kinds = result.amount(result.matches.distances), outcomes_of(result)
+    index = np.arange(len(amounts))
+    axes.plot(index, amounts, color=GRID, lw=1.0, zorder=1)
+    for outcome, mark in MARKS.items():
         mask = kinds == outcome
         if mask.any():
-            style: dict[str, Any] = {'color': color, 'ms': 6, 'mew': 0, 'label': MEANING[outcome]}
-            axes.plot(index[mask], distances[mask], '.', zorder=2, **style)
-    name = f'threshold {threshold:.3g}'
-    axes.axhline(threshold, color=plots.THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
+            axes.plot(index[mask], amounts[mask], ls='none', mew=0, zorder=2, **mark)
+    limit = float(result.amount(threshold))
+    axes.axhline(limit, color=INK, lw=1.3, ls=DASHES, label=f'limit {limit:.3g}', zorder=1.5)
     truth = np.zeros(len(index)) if result.true_places is None else result.true_places
     plots.shade_runs(axes, truth < 0, 'not in the map')
-    axes.set(xlabel='query image', ylabel='distance of the best match')
-    axes.set_xlim(-1, max(1, len(distances)))
-    axes.grid(axis='y', color=plots.GRID, lw=0.7)
-    plots.legend_above(axes, 3)
+    axes.set(xlabel=plots.QUERY, ylabel=f'{result.quantity} of the best match')
+    axes.set_xlim(-1, max(1, len(amounts)))
+    legend_above(axes, 3)

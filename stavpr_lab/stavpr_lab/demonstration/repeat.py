@@ -18,7 +18,11 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 import numpy as np
+from PIL import Image
 from stavpr_lab.demonstration import FEATURES
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import render
@@ -34,12 +38,14 @@ from stavpr_lab.demonstration.street.traverses import (
     RAINY_DUSK,
     Traverse,
 )
+from stavpr_lab.style import CYCLE, DASHES, legend_above, page, STYLE
 from stavpr_nav.evidence import ImageComparison
 from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
 from stavpr_nav.observation import Observation
 from stavpr_ros import Localizer
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, Map
+from stavpr_ros.palette import BLUE, GRAY, ORANGE, QUIET
 from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
@@ -278,46 +284,44 @@ def repeat(
     return Drive(table[:, 0], table[:, 1:4], table[:, 4:6], table[:, 6], reasons, presses)
 
 
-def plot(taught: Taught, drives: dict[str, Drive], path: Path) -> None:
-    """Draw the drives from above, and their error over the distance."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5), layout='constrained')
-    above, over = figure.subplots(1, 2)
-    above.plot(*taught.poses[:, :2].T, color='0.7', linewidth=4, label='taught')
-    for name, drive in drives.items():
-        above.plot(*drive.poses[:, :2].T, linewidth=1, label=name)
-        over.plot(np.cumsum(drive.speeds) * STEP, drive.errors[:, 0], linewidth=1, label=name)
-    above.set(xlabel='x (m)', ylabel='y (m)', aspect='equal')
-    over.set(xlabel='driven (m)', ylabel='left of the taught path (m)', ylim=(-2, 2))
-    for limit in (-0.5, 0.5):
-        over.axhline(limit, color='0.7', linewidth=0.8)
-    above.legend()
-    figure.savefig(path, dpi=100)
+def plot(taught: Taught, drives: list[tuple[str, Drive]], path: Path) -> None:
+    """Draw the drives from above, and their error over the distance, a color for each light."""
+    with page(path, 11, 5) as figure:
+        above, over = figure.subplots(1, 2)
+        above.plot(*taught.poses[:, :2].T, color=GRAY, lw=6, alpha=0.5, label='taught')
+        for light, color, line in zip(CONDITIONS, CYCLE, ('-', '--', '-.'), strict=False):
+            for k, drive in enumerate(drive for name, drive in drives if name == light):
+                label = '' if k else light
+                style = {'color': color, 'ls': line, 'lw': 1.2, 'label': label}
+                above.plot(*drive.poses[:, :2].T, **style)
+                over.plot(np.cumsum(drive.speeds) * STEP, drive.errors[:, 0], **style)
+        above.set(xlabel='x (m)', ylabel='y (m)')
+        above.set_aspect('equal', adjustable='datalim')
+        over.set(xlabel='driven (m)', ylabel='left of the taught path (m)', ylim=(-2, 2))
+        for limit in (-0.5, 0.5):
+            over.axhline(limit, color=QUIET, lw=1.3, ls=DASHES)
+        legend_above(above, 4)
 
 
 def animate(taught: Taught, drive: Drive, images: list[np.ndarray], path: Path) -> None:
     """Write the images of a drive beside the path from above, as WebP."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from PIL import Image
-
     frames = []
     for number in range(0, len(images), INTERVAL):
         step = min(len(drive.times) - 1, number * len(drive.times) // len(images))
-        figure = Figure(figsize=(7, 2.6), layout='constrained')
-        camera, above = figure.subplots(1, 2)
-        camera.imshow(images[number])
-        camera.set_axis_off()
-        camera.set_title(drive.reasons[step] or f'{drive.speeds[step]:.1f} m/s', fontsize=9)
-        above.plot(*taught.poses[:, :2].T, color='0.7', linewidth=4)
-        above.plot(*drive.poses[: step + 1, :2].T, linewidth=1)
-        above.plot(*drive.poses[step, :2], 'o')
-        above.set(aspect='equal')
-        above.set_title(f'{drive.errors[step, 0]:+.2f} m left of the path', fontsize=9)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+        with rc_context(STYLE):
+            figure = Figure(figsize=(7, 2.6), layout='constrained')
+            camera, above = figure.subplots(1, 2)
+            camera.imshow(images[number])
+            camera.set_axis_off()
+            camera.set_title(drive.reasons[step] or f'{drive.speeds[step]:.1f} m/s')
+            above.plot(*taught.poses[:, :2].T, color=GRAY, lw=6, alpha=0.5)
+            above.plot(*drive.poses[: step + 1, :2].T, color=BLUE)
+            above.plot(*drive.poses[step, :2], 'o', color=ORANGE)
+            above.set(aspect='equal', xlabel='x (m)', ylabel='y (m)')
+            above.set_title(f'{drive.errors[step, 0]:+.2f} m left of the path')
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
     frames[0].save(
         path, save_all=True, append_images=frames[1:], duration=MILLISECONDS, loop=0,
         quality=QUALITY,
@@ -373,7 +377,7 @@ def main() -> None:
     parser.add_argument('--laps', type=int, default=len(LAPS))
     arguments = parser.parse_args()
     length, folder = arguments.length, arguments.folder
-    taught, drives = teach(RingWorld(), 0.0, length), {}
+    taught, drives = teach(RingWorld(), 0.0, length), []
     images: list[np.ndarray] = []
     lines = [
         '| lap | pull, rad/m | driven | time | at rest | presses | within 0.5 m | within 1 m '
@@ -391,7 +395,7 @@ def main() -> None:
             taught, CONDITIONS[lap.light], 2 * length / SPEED + 60, 10, lap.left,
             math.copysign(START_ANGLE, lap.left), seed, lap.pull, keep,
         )  # fmt: skip
-        drives[f'{seed + 1}: {lap.light}, {lap.pull:+.2f}'] = drive
+        drives.append((lap.light, drive))
         meters = np.cumsum(drive.speeds) * STEP
         error = drive.errors[meters > CONVERGENCE, 0]
         lines.append(

@@ -15,9 +15,10 @@ from sensor_msgs.msg import CameraInfo
 from stavpr_lab.demonstration.recordings import remove_earlier_bag, TOPIC
 from stavpr_lab.demonstration.street.laps import intrinsics, LapDrive
 from stavpr_lab.demonstration.street.traverses import SIZE
-from stavpr_lab.evaluation.plots import titled_page
+from stavpr_lab.style import titled_page
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.output_file import JSON, write_output
+from stavpr_ros.palette import BLUE, GRAY, ORANGE, VERMILION
 from stavpr_ros.progress import Progress
 from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_ros.sources.bag_writer import write_bag
@@ -180,20 +181,19 @@ def write_result(
     title = 'Three laps of a synthetic street'
     with titled_page(plot, 12.5, 5.5, title, result.summary()) as figure:
         left, right = figure.subplots(1, 2)
-        style: dict[str, Any] = {'lw': 1.0}
-        left.plot(*result.truth[:, :2].T, color='black', label='truth', lw=2.2, alpha=0.5)
-        left.plot(*result.before[:, :2].T, color='#c44', label='odometry', **style)
-        left.plot(*result.poses[:, :2].T, color='#07a', label='optimized', **style)
-        right.plot(*result.in_map[:, :2].T, color='#07a', **style)
-        colors = (('#2a2', 'accepted'), ('#d33', 'rejected'))
-        for ends, (color, name) in zip(edges, colors, strict=True):
+        left.plot(*result.truth[:, :2].T, color=GRAY, label='truth', lw=5, alpha=0.5)
+        left.plot(*result.before[:, :2].T, color=ORANGE, label='odometry', ls='--')
+        left.plot(*result.poses[:, :2].T, color=BLUE, label='optimized')
+        right.plot(*result.in_map[:, :2].T, color=GRAY)
+        styles = ((BLUE, 'accepted', 1.0), (VERMILION, 'rejected', 3.0))
+        for ends, (color, name, width) in zip(edges, styles, strict=True):
             for k, (a, b) in enumerate(ends[:, :, :2]):
                 label = f'{len(ends)} {name}' if k == 0 else None
-                right.plot(*zip(a, b, strict=True), color=color, lw=0.7, alpha=0.6, label=label)
+                right.plot(*zip(a, b, strict=True), color=color, lw=width, label=label)
         left.set_title('aligned with the truth')
         right.set_title('loop closures')
         for axes in (left, right):
             axes.set_aspect('equal', adjustable='datalim')
-            axes.set(xlabel='x in m', ylabel='y in m')
+            axes.set(xlabel='x (m)', ylabel='y (m)')
             axes.legend(loc='upper right')
     return plot

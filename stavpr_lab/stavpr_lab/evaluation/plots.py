@@ -1,60 +1,42 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Plots of results, drawn by matplotlib without a screen and without the global state of pyplot.
+Plots of results in the common style (:mod:`stavpr_lab.style`).
 
 Each function takes plain arrays and the path of the PNG file to write.
 Map indices run along x and query indices along y, as in the paper's matrices.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import io
 from pathlib import Path
 from typing import Any, Literal
 
-from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 import numpy as np
 from stavpr_lab.evaluation.calibration import Calibration
 from stavpr_lab.evaluation.metrics import Metrics
-from stavpr_ros.output_file import PNG, write_output
+from stavpr_lab.style import DASHES, legend_above, page, show_distances, SMALL
+from stavpr_ros.palette import BLUE, GRAY, INK, ORANGE, PAPER, QUIET, rgb, SKY, VERMILION, YELLOW
 
 Outcome = Literal['right', 'wrong', 'match', 'no match', 'unseen']
 Box = tuple[float, float, float, float]
 """Left, top, width and height of a plot's axes as fractions of its image."""
 
-INK, QUIET, GRID, PAPER = '#24272c', '#6b7078', '#dcdcd8', '#ffffff'
-COLORS: dict[str, str] = {
-    'right': '#2e8b57',
-    'wrong': '#c8402f',
-    'match': '#2f7fb8',
-    'no match': '#d99a1c',
-    'unseen': '#8a8f98',
+MARKS: dict[str, dict[str, Any]] = {  # of an outcome: eyes that see no colors have its shape
+    'right': {'color': BLUE, 'marker': 'o', 'ms': 3, 'label': 'match, correct'},
+    'wrong': {'color': VERMILION, 'marker': 'X', 'ms': 6, 'label': 'match, wrong'},
+    'match': {'color': SKY, 'marker': 'o', 'ms': 3, 'label': 'match'},
+    'no match': {'color': ORANGE, 'marker': 'v', 'ms': 5, 'label': 'no match'},
+    'unseen': {'color': GRAY, 'marker': 's', 'ms': 3, 'label': 'no match, correctly'},
 }
-BRIGHT = {'right': '#35d07f', 'wrong': '#ff5440', 'match': '#4fb3ff'}  # on the dark of a matrix
-MEANING: dict[str, str] = {
-    'right': 'match, correct', 'wrong': 'match, wrong', 'match': 'match', 'no match': 'no match',
-    'unseen': 'no match, correctly',
-}  # fmt: skip
-TRUTH, THRESHOLD = '#f0c419', '#3b6ea5'
-SEQUENCE, SEQUENCE_INNER, SINGLE, UNKNOWN = '#2358a5', '#7fa8dc', '#8a94a6', '#d99a1c'
-SCALE = 'bone'  # grays for distances, dark is near: colors are for outcomes
-AXES: dict[str, Any] = {
-    'labelcolor': INK,
-    'edgecolor': QUIET,
-    'linewidth': 0.8,
-    'spines.top': False,
-    'spines.right': False,
-    'axisbelow': True,
-}
-DPI = 150
+COLORS: dict[str, str] = {outcome: mark['color'] for outcome, mark in MARKS.items()}
+MATCHED = ('right', 'wrong', 'match')  # outcomes with a place
+TRUTH, SHADE = YELLOW, '#e9e9e4'
+PLACE, QUERY = 'place in the map (number)', 'query image (number)'  # labels of axes
 BINS = 40  # bars of a histogram
 
 
@@ -65,7 +47,7 @@ class MatchPair:
 
     :param query: RGB, shape (h, w, 3), uint8.
     :param place: the matched place's image, or None without a match.
-    :param caption: a line below, such as index and distance.
+    :param caption: a line below, such as index and probability.
     :param outcome: 'right' or 'wrong' for a match, 'match' without ground truth; 'no match' for a
         place that was missed; 'unseen' for a query that has no place in the map and was rejected.
     """
@@ -126,11 +108,11 @@ def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> N
         for name, (color, metrics) in curves.items():
             _, precision, recall = metrics.curve.T
             best = metrics.best.recall, metrics.best.precision
-            axes.plot(recall, precision, color=color, lw=1.8, label=name, clip_on=False, zorder=3)
+            axes.plot(recall, precision, color=color, label=name, clip_on=False, zorder=3)
             ring: dict[str, Any] = {'ms': 8, 'mfc': PAPER, 'mec': color, 'mew': 1.8, 'zorder': 4}
             axes.plot(*best, 'o', clip_on=False, **ring)
-        axes.set(xlabel='recall', ylabel='precision', xlim=(0, 1), ylim=(0, 1.0), aspect='equal')
-        axes.grid(color=GRID, lw=0.7)
+        axes.set(xlabel='recall (share of the images)', ylabel='precision (share of the matches)')
+        axes.set(xlim=(0, 1), ylim=(0, 1), aspect='equal')
         if curves:
             axes.legend(loc='lower left')
 
@@ -163,11 +145,12 @@ def match_histogram(
             rwidth=0.9,
         )
         if limit is not None:
-            axes.axvline(limit, color=INK, lw=1.3, ls=(0, (5, 3)), label=f'limit {limit:.3g}')
+            axes.axvline(limit, color=INK, lw=1.3, ls=DASHES, label=f'limit {limit:.3g}')
         margin = 0.02 * (high - low)
         axes.set(
-            xlabel=f'{quantity} of the match', ylabel='images', xlim=(low - margin, high + margin)
-        )
+            xlabel=f'{quantity} of the match', ylabel='images (number)',
+            xlim=(low - margin, high + margin),
+        )  # fmt: skip
         axes.locator_params(axis='y', integer=True)
         legend_above(axes, 3)
 
@@ -185,10 +168,9 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
         show_distances(figure, axes, distances, extent=extent, aspect='auto')
-        style: dict[str, Any] = {'color': BRIGHT['right'], 'mec': INK, 'mew': 0.5, 'ms': 4}
-        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', lw=1.6, **style)
+        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', color=BLUE, ms=4, label='warping path')
         legend_above(axes, 1)
-        axes.set(xlabel='place in the map', ylabel='image of the window')
+        axes.set(xlabel=PLACE, ylabel='image of the window (number)')
         axes.locator_params(integer=True)
 
 
@@ -213,18 +195,15 @@ def drive(
     with page(path, 5.2, 5.2) as figure:
         axes = figure.add_subplot()
         if len(truth):
-            axes.plot(*truth.T, '.', color=TRUTH, ms=3, mew=0, label='true place')
+            axes.plot(*truth.T, '.', color=TRUTH, ms=8, mew=0, label='true place')
         shade_runs(axes, unseen, 'unseen')
         rejected = -0.04 * places  # below the axis of the places
-        for outcome, color in COLORS.items():
+        for outcome, mark in MARKS.items():
             at = index[outcomes == outcome]
             if len(at):
-                height = matched[at] if outcome in BRIGHT else np.full(len(at), rejected)
-                marker = '.' if outcome in BRIGHT else '|'
-                style: dict[str, Any] = {'color': color, 'ms': 5, 'label': MEANING[outcome]}
-                axes.plot(at, height, marker, **style)
-        axes.set(xlabel='query image', ylabel='place in the map', xlim=(-1, len(index)))
-        axes.grid(color=GRID, lw=0.7)
+                height = matched[at] if outcome in MATCHED else np.full(len(at), rejected)
+                axes.plot(at, height, ls='none', mew=0, **mark)
+        axes.set(xlabel=QUERY, ylabel=PLACE, xlim=(-1, len(index)))
         legend_above(axes, 3)
 
 
@@ -233,54 +212,17 @@ def reliability(path: Path, calibration: Calibration) -> None:
     has_images = calibration.images > 0
     with page(path, 5.2, 5.6) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-        above.plot([0, 1], [0, 1], color=QUIET, lw=1.2, ls=(0, (5, 3)), label='as declared')
+        above.plot([0, 1], [0, 1], color=QUIET, lw=1.2, ls=DASHES, label='as declared')
         points = calibration.declared[has_images], calibration.right[has_images]
         label = f'expected error {calibration.expected_error:.3f}'
-        above.plot(*points, '-o', color=SEQUENCE, lw=1.8, ms=6, clip_on=False, label=label)
+        above.plot(*points, '-o', color=BLUE, ms=6, clip_on=False, label=label)
         above.set(ylabel='share of correct matches', xlim=(0, 1), ylim=(0, 1))
-        above.grid(color=GRID, lw=0.7)
         legend_above(above, 2)
         width = 1 / len(has_images)
         starts = np.arange(len(has_images)) * width
-        below.bar(starts, calibration.images, 0.9 * width, align='edge', color=SEQUENCE_INNER)
-        below.set(xlabel='declared probability', ylabel='images')
+        below.bar(starts, calibration.images, 0.9 * width, align='edge', color=SKY)
+        below.set(xlabel='declared probability', ylabel='images (number)')
         below.locator_params(axis='y', integer=True, nbins=4)
-
-
-@contextmanager
-def page(path: Path, width: float, height: float) -> Iterator[Figure]:
-    """Yield an empty figure (width and height in inches) in the common style, then write it."""
-    look: dict[Any, Any] = {
-        'font.size': 11.5,
-        'font.family': 'DejaVu Sans',
-        'text.color': INK,
-        'figure.facecolor': PAPER,
-        'legend.frameon': False,
-        'legend.fontsize': 10.5,
-    }
-    look |= {f'axes.{name}': value for name, value in AXES.items()}
-    for side in ('xtick', 'ytick'):
-        look |= {f'{side}.color': QUIET, f'{side}.labelsize': 10.5}
-    with rc_context(look):
-        figure = Figure(figsize=(width, height), dpi=DPI, layout='constrained')
-        yield figure
-        content = io.BytesIO()
-        FigureCanvasAgg(figure).print_png(content)
-        write_output(path, content.getvalue(), PNG, force=True)
-
-
-@contextmanager
-def titled_page(
-    path: Path, width: float, height: float, title: str, text: str
-) -> Iterator[SubFigure]:
-    """Yield the part of a page below its title and a text, ``height`` inches high."""
-    head = 0.5 + 0.17 * len(text.splitlines())
-    with page(path, width, head + height) as figure:
-        parts: Any = figure.subfigures(2, 1, height_ratios=(head, height))
-        top, below = parts
-        top.text(0.012, 0.96, title, fontsize=15, weight='bold', va='top', color=INK)
-        top.text(0.012, 0.06, text, fontsize=10.5, va='bottom', color=QUIET)
-        yield below
 
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:
@@ -293,7 +235,7 @@ def shade_runs(axes: Axes, mask: np.ndarray, label: str) -> None:
     """Shade the images where a mask is true, over the whole height."""
     for number, (first, end) in enumerate(runs(mask)):
         name = '' if number else label
-        axes.axvspan(first - 0.5, end - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
+        axes.axvspan(first - 0.5, end - 0.5, color=SHADE, lw=0, zorder=0, label=name)
 
 
 def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: int) -> None:
@@ -308,7 +250,7 @@ def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: 
         axes.set_axis_off()
     present = [outcome for outcome in COLORS if any(pair.outcome == outcome for pair in pairs)]
     keys = [Line2D([], [], color=COLORS[outcome], lw=3) for outcome in present]
-    names = [MEANING[outcome] for outcome in present]
+    names = [MARKS[outcome]['label'] for outcome in present]
     figure.suptitle(' ', fontsize=10)  # keeps room for the legend, which must not widen the grid
     legend = figure.legend(
         keys, names, loc='upper left', ncols=4, handlelength=1.2, borderaxespad=0.3
@@ -324,12 +266,13 @@ def _draw_pair(axes: Axes, pair: MatchPair) -> None:
     if pair.place is None:
         axes.add_patch(Rectangle((start, 0), width, height, fc='#efefeb', ec='none'))
         middle = (start + width / 2, height / 2)
-        axes.text(*middle, 'no place', ha='center', va='center', color=QUIET, fontsize=9.5)
+        axes.text(*middle, 'no place', ha='center', va='center', color=QUIET)
     else:
         axes.imshow(pair.place, extent=(start, start + width, height, 0), interpolation='lanczos')
     frame: dict[str, Any] = {'ec': COLORS[pair.outcome], 'lw': 2.6, 'clip_on': False}
+    frame['ls'] = '--' if pair.outcome == 'wrong' else '-'
     axes.add_patch(Rectangle((0, 0), start + width, height, fill=False, **frame))
-    axes.set_title(pair.caption, fontsize=9.5, color=INK, y=-0.03, va='top', pad=0)
+    axes.set_title(pair.caption, fontsize=SMALL, y=-0.03, va='top', pad=0, loc='center')
     axes.set(xlim=(0, start + width), ylim=(height, 0), aspect='equal')
 
 
@@ -355,42 +298,11 @@ def draw_matrix(
     show_distances(figure, axes, distances, aspect='auto', extent=extent)
     if truth is not None:
         cells = np.zeros((*truth.shape, 4), np.uint8)
-        cells[truth] = [int(TRUTH[i : i + 2], 16) for i in (1, 3, 5)] + [110]
+        cells[truth] = [*rgb(TRUTH), 190]
         axes.imshow(cells, aspect='auto', extent=extent, interpolation='nearest')
         axes.plot([], [], 's', color=TRUTH, ms=4, label=label)
     for outcome, pairs in matches.items():
         if len(pairs):
-            style: dict[str, Any] = {'color': BRIGHT[outcome], 'label': MEANING[outcome]}
-            axes.plot(pairs[:, 1], pairs[:, 0], '.', ms=4, mew=0, **style)
-    axes.set(xlabel='place in the map', ylabel='query image', xlim=extent[:2], ylim=extent[2:])
-    for handle in legend_above(axes, 3).get_lines():
-        handle.set_markersize(9)
-
-
-def legend_above(axes: Axes, columns: int) -> Legend:
-    """Put the legend above the axes, where it covers nothing and does not widen the layout."""
-    legend = axes.legend(
-        *axes.get_legend_handles_labels(), loc='lower left', bbox_to_anchor=(0, 1.0),
-        ncols=columns, borderaxespad=0.2, handlelength=1.2, columnspacing=1.2, handletextpad=0.4,
-    )  # fmt: skip
-    legend.set_in_layout(False)
-    lines = -(-len(legend.get_texts()) // columns)
-    axes.set_title('\n'.join(' ' * lines), fontsize=13)  # keeps room for it
-    return legend
-
-
-def show_distances(
-    figure: Figure | SubFigure, axes: Axes, distances: np.ndarray, **options: Any
-) -> None:
-    """
-    Draw distances in grays from their 0.2 % to their 99.5 % quantile, with the scale beside them.
-
-    :param distances: shape (rows, columns); others than finite ones are left white.
-    :param options: options of :meth:`matplotlib.axes.Axes.imshow`.
-    """
-    finite = distances[np.isfinite(distances)]
-    low, high = np.quantile(finite, [0.002, 0.995]) if finite.size else (0.0, 1.0)
-    image = axes.imshow(distances, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6), **options)
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.015, aspect=32)
-    bar.outline.set_visible(False)
-    bar.set_ticks([low, max(high, low + 1e-6)], labels=['near', 'far'])  # may be negative
+            axes.plot(pairs[:, 1], pairs[:, 0], ls='none', mew=0, **MARKS[outcome])
+    axes.set(xlabel=PLACE, ylabel=QUERY, xlim=extent[:2], ylim=extent[2:])
+    legend_above(axes, 3)

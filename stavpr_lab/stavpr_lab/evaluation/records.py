@@ -34,6 +34,15 @@ class TraverseEvaluation:
     seconds: np.ndarray
 
     @property
+    def quantity(self) -> str:
+        """Return what decides on a match: the probability, or in mode paper the distance."""
+        return 'probability' if np.isfinite(self.matches.probabilities).any() else 'distance'
+
+    def amount(self, distances: Any) -> Any:
+        """Return distances of matches as amounts of :attr:`quantity`."""
+        return 1 - distances if self.quantity == 'probability' else distances
+
+    @property
     def matched(self) -> np.ndarray:
         """Return the accepted place of each image, -1 = none, shape (N,)."""
         return np.where(self.accepted, self.matches.places, -1)

@@ -14,6 +14,7 @@ from stavpr_lab.evaluation.evaluate import Evaluation
 from stavpr_lab.evaluation.plots import Box
 from stavpr_lab.evaluation.report import chosen_window, METRICS, Report, worst_mistakes
 from stavpr_lab.evaluation.report_page import html_page
+from stavpr_ros import palette
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import csv_kind, HTML, JSON, require_replaceable, write_output
 
@@ -126,17 +127,17 @@ def _draw(report: Report, folder: Path) -> Box:
 
 def _draw_curves(evaluation: Evaluation, path: Path) -> None:
     kinds = {
-        'sequences': (plots.SEQUENCE, evaluation.sequence),
-        'sequences, without the ends': (plots.SEQUENCE_INNER, evaluation.sequence_without_ends),
-        'single images': (plots.SINGLE, evaluation.single),
+        'sequences': (palette.BLUE, evaluation.sequence),
+        'sequences, without the ends': (palette.SKY, evaluation.sequence_without_ends),
+        'single images': (palette.GRAY, evaluation.single),
     }
     plots.precision_recall(path, kinds)
 
 
 def _draw_distances(report: Report, path: Path) -> None:
-    colors = {'correct': 'right', 'wrong': 'wrong', 'match': 'match'}
+    colors = {'correct': palette.BLUE, 'wrong': palette.VERMILION, 'match': palette.SKY}
     groups = {
-        name: (plots.COLORS[colors[name]] if name in colors else plots.UNKNOWN, report.amount(row))
+        name: (colors.get(name, palette.ORANGE), report.amount(row))
         for name, row in report.evaluation.distances.items()
     }
     best, default = report.evaluation.sequence.best.threshold, report.default_threshold

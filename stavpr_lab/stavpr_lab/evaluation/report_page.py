@@ -15,10 +15,11 @@ from stavpr_lab.evaluation.drive import UNSEEN_DISTANCE
 from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import RANKS
-from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
+from stavpr_lab.evaluation.plots import Box
 from stavpr_lab.evaluation.protocol import text
 from stavpr_lab.evaluation.report import jsonable, METRICS, Report
 from stavpr_lab.evaluation.verdict import verdict_of
+from stavpr_ros import palette
 from stavpr_ros.mapping import Map
 from stavpr_ros.prepare.centering import evenly
 
@@ -59,7 +60,7 @@ def html_page(report: Report, mistakes: list[int], plots: Mapping[str, bytes], b
         has_truth=report.has_truth,
         quantity=report.quantity,
         false_alarms=evaluation.false_alarm_rates,
-        colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
+        palette=palette,
         decision=report.decision(),
         error_rate=text(report.estimates[0]),
         recall=text(report.estimates[1]),

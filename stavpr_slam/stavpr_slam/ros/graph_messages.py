@@ -9,6 +9,7 @@ from geometry_msgs.msg import Point
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from stavpr_msgs.msg import LoopClosure, RelativePose
+from stavpr_ros.palette import BLUE, rgb, VERMILION
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure
@@ -18,7 +19,10 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-ACCEPTED, REJECTED = ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8), ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5)
+ACCEPTED, REJECTED = (
+    ColorRGBA(r=red / 255, g=green / 255, b=blue / 255, a=0.8)
+    for red, green, blue in (rgb(BLUE), rgb(VERMILION))
+)
 
 
 def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
