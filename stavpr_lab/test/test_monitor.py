@@ -111,7 +111,8 @@ def test_server_serves_the_page_the_events_and_the_image(browser, history):
     status, line = browser('GET', '/events')
     events = json.loads(line.removeprefix(b'data: '))
     assert events.pop('now') == pytest.approx(time.monotonic(), abs=TIMEOUT)
-    assert (status, events) == (200, {'state': 'active', 'image': 2, 'samples': []})
+    assert events.pop('image') == pytest.approx(time.monotonic(), abs=TIMEOUT)
+    assert (status, events) == (200, {'state': 'active', 'samples': []})
     assert browser('GET', '/image.jpg?2') == (200, b'jpeg')
     assert browser('GET', '/../setup.py')[0] == 404
 
@@ -125,6 +126,9 @@ class EventSource {
 </script>"""
 
 
+SECTIONS = 'images', 'position', 'distances', 'probability', 'health'
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
 @pytest.mark.parametrize('route', [[], [[0, 0], [9, 4]]], ids=['places', 'poses'])
 @pytest.mark.parametrize('old', [0, 104])
@@ -133,7 +137,8 @@ def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
     history.set('map', {'operation': 'localization', 'state': 'fixed', 'places': 90, 'path': ''})
     history.set('route', route)
     history.set('pose', [4, 2, 0, 7.0])
-    texts = {'status': 'match', 'reason': '', 'row': ''}
+    texts = {'status': 'match', 'reason': '', 'row': 'AP+A'}
+    history.set('diagnostics', {'time': 7.0, 'statuses': []})
     history.add({'time': 7.0, 'span': [0, 1]} | texts | numbers)
     news = json.dumps(history.since(0, 0)[1] | {'now': 7.0 + old})
     content = (files('stavpr_lab.monitor') / 'page.html').read_text()
@@ -153,10 +158,15 @@ def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
         now = re.search(r'<div id="now"[^>]*>[^<]*', shown)[0]
         if 'no image yet' not in now:
             break
-    assert ('stale' in now, bool(re.search(r'\d+ s ago: place 40', now))) == (old > 0,) * 2, now
+    assert 'place 40' in now
+    sections = re.findall(r'<section id="(\w+)"(?: class="(stale)?")?>', shown)
+    assert sections == [(name, 'stale' * (old > 0)) for name in SECTIONS]
+    ages = re.findall(r'class="age">(\d+)[.\d]* s ago<', shown)
+    assert len(ages) == len(SECTIONS)
+    assert all(old <= int(age) < old + TIMEOUT for age in ages)
     pixels = cv2.imread(str(shot)).astype(int)[:, 530:]  # position on the map, and the right half
-    is_green = pixels[..., 1] - pixels[..., [0, 2]].max(axis=-1) > 40
-    assert bool(is_green[:350].sum() > 50) is (old == 0)
+    is_blue = pixels[..., 0] - pixels[..., 2] > 120
+    assert bool(is_blue[:350].sum() > 50) is (old == 0)
 
 
 def test_server_runs_commands_and_returns_their_errors(browser):
@@ -234,7 +244,8 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
     assert parts['map']['places'] == len(parts['route']) == 60
     match = next(sample for sample in parts['samples'] if sample['status'] == 'match')
     assert match['probability'] > 0.05
-    assert {part['name'].split()[-1] for part in parts['diagnostics']} >= {'input', 'map'}
+    statuses = parts['diagnostics']['statuses']
+    assert {status['name'].split()[-1] for status in statuses} >= {'input', 'map'}
     assert history.image[:2] == b'\xff\xd8'
     robot.until(lambda: monitor._images is None, 'no subscription without a page')
     assert command('reset') == 'the window is empty'

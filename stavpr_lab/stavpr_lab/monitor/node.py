@@ -32,6 +32,7 @@ from std_srvs.srv import Trigger
 
 MAX_SAMPLES = 3000  # samples: four minutes
 SAMPLE_SECONDS = 0.08  # minimum time between two samples
+STALE_SECONDS = 3.0  # without an answer of the node: its state is unknown
 POLL_SECONDS = 0.5  # for the state of the node, and whether images are needed
 ROUTE_POINTS = 1000  # points of the map's route that are drawn, at most
 COLUMN_BYTES = 8  # bytes of a column of ``~/distances``: a distance and its place, float32
@@ -95,9 +96,9 @@ class History:
                 self._changed.notify_all()
 
     def show(self, image: bytes) -> None:
-        """Replace the match image."""
+        """Replace the match image; its part is when it arrived."""
         self.image = image
-        self.set('image', self._version + 1)
+        self.set('image', time.monotonic())
 
     def since(self, version: int, timeout: float) -> tuple[int, dict[str, Any]]:
         """Return the newest version and all changes since one; wait until there are any."""
@@ -215,6 +216,8 @@ class Monitor:
         if self._state_request is not None:
             future, began = self._state_request
             if not future.done() and time.monotonic() - began < TIMEOUT:
+                if time.monotonic() - began > STALE_SECONDS:
+                    self.history.set('state', 'no answer')
                 return
             self._get_state.remove_pending_request(future)
         future = self._get_state.call_async(GetState.Request())
@@ -277,7 +280,7 @@ class Monitor:
             if self._full_name.strip('/') in status.name
         ]
         if own:
-            self.history.set('diagnostics', own)
+            self.history.set('diagnostics', {'time': time.monotonic(), 'statuses': own})
 
     def _on_image(self, message: CompressedImage) -> None:
         self.history.show(bytes(message.data))
