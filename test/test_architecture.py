@@ -7,6 +7,7 @@ from graphlib import TopologicalSorter
 import importlib
 from operator import attrgetter
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from stavpr_ros import method
 from stavpr_ros.former import CLASSES, FIELDS
-from stavpr_ros.method import Match, Status
+from stavpr_ros.method import localizer, Match, Status
 from stavpr_ros.method import Path as MatchPath
 from stavpr_ros.pipeline import ImageResult
 
@@ -224,3 +225,38 @@ def test_former_field_warns_and_is_the_present_one(kind):
 def test_import_of_the_package_stays_light():
     code = "import stavpr_ros, sys; print({'numpy', 'stavpr_ros.api'} & {*sys.modules})"
     assert subprocess.check_output([sys.executable, '-c', code], text=True) == 'set()\n'
+
+
+# The diagram of the chain in docs/architecture.md
+
+CHAIN = {'update', 'push', '_z', 'add', 'assess', '_assess', '_compare', '_match', '_decide'}
+OBJECTS = 'centering|matcher|motion|change|filter|cells|means|recent|limits|quantities'
+IN_CHAIN = re.compile(rf'(?:self\.)?_?((?:{OBJECTS})\.[a-z]\w*)')
+
+
+def calls_of(name, methods, functions):
+    """Yield what a method of the chain calls, in order, with its other methods in their place."""
+    calls = [node for node in ast.walk(methods[name]) if isinstance(node, ast.Call)]
+    for call in sorted(calls, key=lambda node: (node.end_lineno, node.end_col_offset)):
+        text = ast.unparse(call.func)
+        if (method := text.rpartition('.')[2]) in CHAIN and not IN_CHAIN.fullmatch(text):
+            yield from calls_of(method, methods, functions)
+        elif (match := IN_CHAIN.fullmatch(text)) or text in functions:
+            yield match[1].removeprefix('_') if match else text
+
+
+def test_diagram_of_the_chain_has_all_steps_and_calls_of_the_code_in_order():
+    methods, functions = {}, set()
+    for file in ('window', 'localizer'):  # SequenceRecognizer._match is the step, not the window's
+        for node in ast.walk(ast.parse((PACKAGE / f'method/{file}.py').read_text())):
+            if isinstance(node, ast.FunctionDef) and node.name in CHAIN:
+                methods[node.name] = node
+            elif isinstance(node, ast.ImportFrom) and re.search('method|prepare', node.module):
+                functions |= {alias.name for alias in node.names if alias.name.islower()}
+    text = (ROOT / 'docs' / 'architecture.md').read_text()
+    diagram = re.search(r'```\n( strips -> .*?)```', text, re.DOTALL)[1]
+    steps = re.findall(r'(\d) (\w+) +(.+?):', diagram, re.DOTALL)
+    called = [name for *_, names in steps for name in re.split(r',\s+', names)]
+    assert called == list(dict.fromkeys(calls_of('update', methods, functions)))
+    documented = re.findall(r'^(\d)\. \*\*(\w+)\*\*', localizer.__doc__.lower(), re.MULTILINE)
+    assert [step[:2] for step in steps] == documented

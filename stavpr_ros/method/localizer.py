@@ -5,18 +5,19 @@ The chain, image by image (:meth:`PlaceRecognizer.update`).
 
 1. **Light**: the running mean of the query is subtracted, and the rest whitened
    (:class:`stavpr_ros.prepare.centering.MeanCentering`).
-2. **Distances** to all places (:mod:`stavpr_ros.prepare.matcher`), normalized to **z**
-   (:func:`stavpr_ros.prepare.centering.z_normalized`).
-3. **Motion**: whether the camera moved, and how much (:class:`.motion.ImageChange`).
-4. **Window and filter**: an image that moved advances the states
-   (:meth:`.window.FilterWindow.add`, :meth:`.filter.Filter.update`).
-5. **Place** of the middle image by all of the window, and its path
-   (:meth:`.filter.Filter.beliefs`, :func:`.path.centered_place`, :func:`.path.follow`).
-6. **Evidence**: belief, checks of the path, lead, cells, recent windows (:mod:`.evidence`).
-7. **Match**: the limits, odometry, and the newest images alone where the window shows nothing
+2. **Distances** to all places (:mod:`stavpr_ros.prepare.matcher`).
+3. **z**: less their mean, by their deviation (:func:`stavpr_ros.prepare.centering.z_normalized`).
+4. **Motion**: whether the camera moved, and how much (:class:`.motion.ImageChange`).
+5. **Filter**: an image that moved advances the states (:meth:`.filter.Filter.update`).
+6. **Place** of the middle image by all of the window
+   (:meth:`.filter.Filter.beliefs`, :func:`.path.centered_place`).
+7. **Path** through the places of the window (:func:`.path.follow`).
+8. **Evidence**: belief, checks of the path, lead, cells, recent windows (:mod:`.evidence`).
+9. **Match**: the limits, odometry, and the newest images alone where the window shows nothing
    (:meth:`SequenceRecognizer._match`).
 
-Steps 3 to 6 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_window` instead.
+Steps 3 to 8 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_window` instead.
+docs/architecture.md has their diagram.
 """
 
 from abc import ABC, abstractmethod
