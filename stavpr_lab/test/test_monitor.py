@@ -15,6 +15,7 @@ import threading
 import time
 
 import cv2
+from lifecycle_msgs.srv import GetState
 from processes import Process, TIMEOUT
 import pytest
 import rclpy
@@ -25,6 +26,7 @@ from stavpr_lab.monitor.node import History, Monitor
 from stavpr_lab.monitor.server import MonitorServer
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.palette import BLUE, INK, ORANGE, VERMILION
 
 CHROMIUM = shutil.which('chromium')
 
@@ -103,6 +105,9 @@ def test_server_serves_the_page_the_events_and_the_image(browser, history):
     status, page = browser('GET', '/')
     assert status == 200
     assert b'<canvas id="matrix"' in page
+    colors = dict(re.findall(r'--(\w+): (#\w{6});', page.decode().partition('@media')[0]))
+    palette = {'ok': BLUE, 'warn': ORANGE, 'error': VERMILION, 'ink': INK}
+    assert palette.items() <= colors.items()
     # nothing from the network
     assert not re.findall(rb'(?:src|href)="(?!data:)|https?://|@import|url\(', page)
     assert browser('GET', '/image.jpg')[0] == 404
@@ -264,6 +269,21 @@ def test_monitor_without_a_node_refuses_commands(context, history):
     with pytest.raises(StavprError, match='/nobody is not running'):
         monitor.command('stop', '')
     assert history.since(0, TIMEOUT)[1]['state'] == 'not found'
+    node.destroy_node()
+
+
+def test_monitor_does_not_know_the_state_of_a_node_that_does_not_answer(
+    context, history, monkeypatch
+):
+    node = rclpy.create_node('lonely', context=context)
+    node.create_service(GetState, 'silent/get_state', None)  # nobody spins it
+    monitor = Monitor(node, 'silent', history)
+    monkeypatch.setattr('stavpr_lab.monitor.node.STALE_SECONDS', -1)
+    assert monitor._get_state.wait_for_service(TIMEOUT)
+    monitor._poll()
+    assert history.since(0, 0)[1]['state'] == 'not found'
+    monitor._poll()
+    assert history.since(0, 0)[1]['state'] == 'no answer'
     node.destroy_node()
 
 
