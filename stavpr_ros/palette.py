@@ -10,7 +10,7 @@ YELLOW = '#f0e442'  # the true place
 GREEN, PURPLE = '#009e73', '#cc79a7'  # other curves
 GRAY = '#80848a'  # rightly no match
 INK, QUIET = '#20242a', '#5f6670'  # text; axes and remarks
-GRID, PAPER = '#dddeda', '#ffffff'
+GRID, SHADE, PAPER = '#dddeda', '#e9e9e4', '#ffffff'
 
 
 def rgb(color: str) -> tuple[int, int, int]:

@@ -4,6 +4,8 @@
 
 from dataclasses import replace
 import json
+from pathlib import Path
+import re
 
 import cv2
 from evaluation_commands import write_images
@@ -100,7 +102,7 @@ def test_drive_shows_outcomes_true_places_and_unseen_images(path):
     outcomes = np.repeat(['right', 'wrong', 'no match', 'unseen'], 10)
     truth = np.stack([queries, queries], axis=1)[:30]
     drive(path, truth, 50, np.where(outcomes == 'wrong', 45, queries), outcomes, queries >= 30)
-    assert all(colors_of(path, BLUE, RED, AMBER, GRAY, YELLOW, (233, 233, 228)))
+    assert all(colors_of(path, BLUE, RED, AMBER, GRAY, YELLOW, palette.rgb(palette.SHADE)))
     drive(path, truth[:0], 50, queries, outcomes, queries < 0)
     assert colors_of(path, YELLOW) == [False]
 
@@ -134,3 +136,11 @@ def test_animation_has_every_fifth_image_beside_its_place(tmp_path, small_map, r
     np.testing.assert_allclose(bars, [NO_MATCH, NO_MATCH, RIGHT], atol=25)
     write_animation(tmp_path, tmp_path / 'subgoal.webp', ahead=3)
     assert (tmp_path / 'subgoal.webp').read_bytes() != (tmp_path / 'demo.webp').read_bytes()
+
+
+def test_all_pictures_take_colors_and_style_from_the_two_modules_of_the_style():
+    root = Path(__file__).resolve().parents[2]
+    files = {*root.glob('stavpr_*/**/*.py'), *root.glob('benchmarks/*.py')}
+    own = re.compile(r"'#[0-9a-fA-F]{3,6}'|color='[a-z0-9.]+'|pyplot|rcParams|fontsize=[0-9.]+")
+    names = {f.name for f in files if 'test' not in f.parts and own.search(f.read_text())}
+    assert names == {'palette.py', 'style.py'}

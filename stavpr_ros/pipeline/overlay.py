@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.method import Match
-from stavpr_ros.palette import BLUE, INK, ORANGE, PAPER, rgb
+from stavpr_ros.palette import BLUE, INK, ORANGE, PAPER, rgb, SHADE
 from stavpr_ros.pipeline.result import ImageResult
 
 RIGHT, NO_MATCH = rgb(BLUE), rgb(ORANGE)
 NEARBY = 150  # places shown to each side of a match
 SIZE = (900, 240)  # pixels of the drawn distances, about
-_INK, _PAPER, _EMPTY = rgb(INK), rgb(PAPER), (226, 226, 222)
+_INK, _PAPER, _EMPTY = rgb(INK), rgb(PAPER), rgb(SHADE)
 
 
 def draw_match(result: ImageResult, places: Map | GrowingMap | None) -> np.ndarray:

@@ -20,22 +20,22 @@ import numpy as np
 from stavpr_lab.evaluation.calibration import Calibration
 from stavpr_lab.evaluation.metrics import Metrics
 from stavpr_lab.style import DASHES, legend_above, page, show_distances, SMALL
-from stavpr_ros.palette import BLUE, GRAY, INK, ORANGE, PAPER, QUIET, rgb, SKY, VERMILION, YELLOW
+from stavpr_ros import palette
 
 Outcome = Literal['right', 'wrong', 'match', 'no match', 'unseen']
 Box = tuple[float, float, float, float]
 """Left, top, width and height of a plot's axes as fractions of its image."""
 
 MARKS: dict[str, dict[str, Any]] = {  # of an outcome: eyes that see no colors have its shape
-    'right': {'color': BLUE, 'marker': 'o', 'ms': 3, 'label': 'match, correct'},
-    'wrong': {'color': VERMILION, 'marker': 'X', 'ms': 6, 'label': 'match, wrong'},
-    'match': {'color': SKY, 'marker': 'o', 'ms': 3, 'label': 'match'},
-    'no match': {'color': ORANGE, 'marker': 'v', 'ms': 5, 'label': 'no match'},
-    'unseen': {'color': GRAY, 'marker': 's', 'ms': 3, 'label': 'no match, correctly'},
+    'right': {'color': palette.BLUE, 'marker': 'o', 'ms': 3, 'label': 'match, correct'},
+    'wrong': {'color': palette.VERMILION, 'marker': 'X', 'ms': 6, 'label': 'match, wrong'},
+    'match': {'color': palette.SKY, 'marker': 'o', 'ms': 3, 'label': 'match'},
+    'no match': {'color': palette.ORANGE, 'marker': 'v', 'ms': 5, 'label': 'no match'},
+    'unseen': {'color': palette.GRAY, 'marker': 's', 'ms': 3, 'label': 'no match, correctly'},
 }
 COLORS: dict[str, str] = {outcome: mark['color'] for outcome, mark in MARKS.items()}
 MATCHED = ('right', 'wrong', 'match')  # outcomes with a place
-TRUTH, SHADE = YELLOW, '#e9e9e4'
+TRUTH = palette.YELLOW
 PLACE, QUERY = 'place in the map (number)', 'query image (number)'  # labels of axes
 BINS = 40  # bars of a histogram
 
@@ -109,7 +109,7 @@ def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> N
             _, precision, recall = metrics.curve.T
             best = metrics.best.recall, metrics.best.precision
             axes.plot(recall, precision, color=color, label=name, clip_on=False, zorder=3)
-            ring: dict[str, Any] = {'ms': 8, 'mfc': PAPER, 'mec': color, 'mew': 1.8, 'zorder': 4}
+            ring: dict[str, Any] = {'ms': 8, 'mfc': 'white', 'mec': color, 'mew': 1.8, 'zorder': 4}
             axes.plot(*best, 'o', clip_on=False, **ring)
         axes.set(xlabel='recall (share of the images)', ylabel='precision (share of the matches)')
         axes.set(xlim=(0, 1), ylim=(0, 1), aspect='equal')
@@ -145,7 +145,7 @@ def match_histogram(
             rwidth=0.9,
         )
         if limit is not None:
-            axes.axvline(limit, color=INK, lw=1.3, ls=DASHES, label=f'limit {limit:.3g}')
+            axes.axvline(limit, color=palette.INK, lw=1.3, ls=DASHES, label=f'limit {limit:.3g}')
         margin = 0.02 * (high - low)
         axes.set(
             xlabel=f'{quantity} of the match', ylabel='images (number)',
@@ -168,7 +168,7 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
         show_distances(figure, axes, distances, extent=extent, aspect='auto')
-        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', color=BLUE, ms=4, label='warping path')
+        axes.plot(pairs[:, 1] + first, pairs[:, 0], 'o-', ms=4, label='warping path')
         legend_above(axes, 1)
         axes.set(xlabel=PLACE, ylabel='image of the window (number)')
         axes.locator_params(integer=True)
@@ -212,15 +212,15 @@ def reliability(path: Path, calibration: Calibration) -> None:
     has_images = calibration.images > 0
     with page(path, 5.2, 5.6) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-        above.plot([0, 1], [0, 1], color=QUIET, lw=1.2, ls=DASHES, label='as declared')
+        above.plot([0, 1], [0, 1], color=palette.QUIET, lw=1.2, ls=DASHES, label='as declared')
         points = calibration.declared[has_images], calibration.right[has_images]
         label = f'expected error {calibration.expected_error:.3f}'
-        above.plot(*points, '-o', color=BLUE, ms=6, clip_on=False, label=label)
+        above.plot(*points, '-o', color=palette.BLUE, ms=6, clip_on=False, label=label)
         above.set(ylabel='share of correct matches', xlim=(0, 1), ylim=(0, 1))
         legend_above(above, 2)
         width = 1 / len(has_images)
         starts = np.arange(len(has_images)) * width
-        below.bar(starts, calibration.images, 0.9 * width, align='edge', color=SKY)
+        below.bar(starts, calibration.images, 0.9 * width, align='edge', color=palette.SKY)
         below.set(xlabel='declared probability', ylabel='images (number)')
         below.locator_params(axis='y', integer=True, nbins=4)
 
@@ -235,13 +235,13 @@ def shade_runs(axes: Axes, mask: np.ndarray, label: str) -> None:
     """Shade the images where a mask is true, over the whole height."""
     for number, (first, end) in enumerate(runs(mask)):
         name = '' if number else label
-        axes.axvspan(first - 0.5, end - 0.5, color=SHADE, lw=0, zorder=0, label=name)
+        axes.axvspan(first - 0.5, end - 0.5, color=palette.SHADE, lw=0, zorder=0, label=name)
 
 
 def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: int) -> None:
     """Draw the pairs on a grid, with a legend of the colors above."""
     if not pairs:
-        figure.text(0.5, 0.5, 'no images to show', ha='center', va='center', color=QUIET)
+        figure.text(0.5, 0.5, 'no images to show', ha='center', va='center', color=palette.QUIET)
         return
     grid = figure.subplots(-(-len(pairs) // columns), columns, squeeze=False)
     for axes, pair in zip(grid.flat, pairs, strict=False):
@@ -251,7 +251,7 @@ def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: 
     present = [outcome for outcome in COLORS if any(pair.outcome == outcome for pair in pairs)]
     keys = [Line2D([], [], color=COLORS[outcome], lw=3) for outcome in present]
     names = [MARKS[outcome]['label'] for outcome in present]
-    figure.suptitle(' ', fontsize=10)  # keeps room for the legend, which must not widen the grid
+    figure.suptitle(' ', fontsize=SMALL)  # room for the legend, which must not widen the grid
     legend = figure.legend(
         keys, names, loc='upper left', ncols=4, handlelength=1.2, borderaxespad=0.3
     )
@@ -264,9 +264,9 @@ def _draw_pair(axes: Axes, pair: MatchPair) -> None:
     start = width * 1.03  # left edge of the place
     axes.imshow(pair.query, extent=(0, width, height, 0), interpolation='lanczos')
     if pair.place is None:
-        axes.add_patch(Rectangle((start, 0), width, height, fc='#efefeb', ec='none'))
+        axes.add_patch(Rectangle((start, 0), width, height, fc=palette.SHADE, ec='none'))
         middle = (start + width / 2, height / 2)
-        axes.text(*middle, 'no place', ha='center', va='center', color=QUIET)
+        axes.text(*middle, 'no place', ha='center', va='center', color=palette.QUIET)
     else:
         axes.imshow(pair.place, extent=(start, start + width, height, 0), interpolation='lanczos')
     frame: dict[str, Any] = {'ec': COLORS[pair.outcome], 'lw': 2.6, 'clip_on': False}
@@ -298,7 +298,7 @@ def draw_matrix(
     show_distances(figure, axes, distances, aspect='auto', extent=extent)
     if truth is not None:
         cells = np.zeros((*truth.shape, 4), np.uint8)
-        cells[truth] = [*rgb(TRUTH), 190]
+        cells[truth] = [*palette.rgb(TRUTH), 190]
         axes.imshow(cells, aspect='auto', extent=extent, interpolation='nearest')
         axes.plot([], [], 's', color=TRUTH, ms=4, label=label)
     for outcome, pairs in matches.items():
