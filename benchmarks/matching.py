@@ -83,7 +83,6 @@ def main(arguments: list[str] | None = None) -> int:
     from stavpr_ros.threads import wait_passively
 
     wait_passively()  # as the node does; before torch and numba are imported
-    from graphs import draw
     from memory import CASES, measure_memory, TARGET
     from peaks import measure_peaks
     from report import report
@@ -108,7 +107,9 @@ def main(arguments: list[str] | None = None) -> int:
     write_json(options.output / name, document)
     lines = report(about, run, memory)
     write_lines((options.output / name).with_suffix('.md'), lines)
-    if importlib.util.find_spec('matplotlib'):
+    if all(map(importlib.util.find_spec, ('matplotlib', 'stavpr_lab'))):
+        from graphs import draw
+
         documented = options.output == RESULTS and not options.quick
         draw(run.rows, GRAPH if documented else (options.output / name).with_suffix('.png'))
     first, last = lines.index('## Targets'), lines.index('## All stages')
