@@ -204,7 +204,7 @@ def drive(
                 height = matched[at] if outcome in MATCHED else np.full(len(at), rejected)
                 axes.plot(at, height, ls='none', mew=0, **mark)
         axes.set(xlabel=QUERY, ylabel=PLACE, xlim=(-1, len(index)))
-        legend_above(axes, 3)
+        legend_above(axes, 2)
 
 
 def reliability(path: Path, calibration: Calibration) -> None:
