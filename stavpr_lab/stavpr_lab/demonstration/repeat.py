@@ -18,9 +18,6 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 import numpy as np
 from PIL import Image
 from stavpr_lab.demonstration import FEATURES
@@ -38,14 +35,14 @@ from stavpr_lab.demonstration.street.traverses import (
     RAINY_DUSK,
     Traverse,
 )
-from stavpr_lab.style import CYCLE, DASHES, legend_above, page, STYLE
+from stavpr_lab.style import CYCLE, DASHES, legend_above, page
 from stavpr_nav.evidence import ImageComparison
 from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
 from stavpr_nav.observation import Observation
 from stavpr_ros import Localizer
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, Map
-from stavpr_ros.palette import BLUE, GRAY, ORANGE, QUIET
+from stavpr_ros.palette import GRAY, QUIET
 from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
@@ -305,23 +302,21 @@ def plot(taught: Taught, drives: list[tuple[str, Drive]], path: Path) -> None:
 
 def animate(taught: Taught, drive: Drive, images: list[np.ndarray], path: Path) -> None:
     """Write the images of a drive beside the path from above, as WebP."""
-    frames = []
+    frames, file = [], path.with_name('frame.png')
     for number in range(0, len(images), INTERVAL):
         step = min(len(drive.times) - 1, number * len(drive.times) // len(images))
-        with rc_context(STYLE):
-            figure = Figure(figsize=(7, 2.6), layout='constrained')
+        with page(file, 7, 2.6) as figure:
             camera, above = figure.subplots(1, 2)
             camera.imshow(images[number])
             camera.set_axis_off()
             camera.set_title(drive.reasons[step] or f'{drive.speeds[step]:.1f} m/s')
             above.plot(*taught.poses[:, :2].T, color=GRAY, lw=6, alpha=0.5)
-            above.plot(*drive.poses[: step + 1, :2].T, color=BLUE)
-            above.plot(*drive.poses[step, :2], 'o', color=ORANGE)
+            above.plot(*drive.poses[: step + 1, :2].T)
+            above.plot(*drive.poses[step, :2], 'o')
             above.set(aspect='equal', xlabel='x (m)', ylabel='y (m)')
             above.set_title(f'{drive.errors[step, 0]:+.2f} m left of the path')
-            canvas = FigureCanvasAgg(figure)
-            canvas.draw()
-            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+        frames.append(Image.open(file).convert('RGB'))
+    file.unlink()
     frames[0].save(
         path, save_all=True, append_images=frames[1:], duration=MILLISECONDS, loop=0,
         quality=QUALITY,

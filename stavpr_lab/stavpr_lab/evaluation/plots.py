@@ -147,10 +147,8 @@ def match_histogram(
         if limit is not None:
             axes.axvline(limit, color=palette.INK, lw=1.3, ls=DASHES, label=f'limit {limit:.3g}')
         margin = 0.02 * (high - low)
-        axes.set(
-            xlabel=f'{quantity} of the match', ylabel='images (number)',
-            xlim=(low - margin, high + margin),
-        )  # fmt: skip
+        axes.set(xlabel=f'{quantity} of the match', ylabel='images (number)')
+        axes.set_xlim(low - margin, high + margin)
         axes.locator_params(axis='y', integer=True)
         legend_above(axes, 3)
 
