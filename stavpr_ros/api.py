@@ -57,7 +57,7 @@ class Localizer:
 
     @cached_property
     def extractor(self) -> FeatureExtractor:
-        """The extractor of the map; a map of vectors from a file has none."""
+        """Return the extractor of the map; a map of vectors from a file has none."""
         return self.route.extractor(self._device)
 
     def __call__(

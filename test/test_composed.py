@@ -184,7 +184,7 @@ def test_save_path_that_cannot_be_written_is_rejected(make_node, tmp_path):
 
 
 def test_limit_of_threads_can_be_removed(make_node):
-    """OpenCV has one limit for the process, numba one for the worker."""
+    """A limit of OpenCV is for the process, one of numba for the worker."""
     limit_threads(0)
     before = numba.get_num_threads(), cv2.getNumThreads()
     node = make_node(threads=1)

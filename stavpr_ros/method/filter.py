@@ -401,7 +401,9 @@ def power(x, doublings=6):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def advance(states, z, slope, offset, most, steps, change, entering, scale, new, sums):  # type: ignore[no-untyped-def]
+def advance(  # type: ignore[no-untyped-def]
+    states, z, slope, offset, most, steps, change, entering, scale, new, sums
+):
     """
     Write the states one image later, and their sums by column, before they are normalized.
 
@@ -519,7 +521,9 @@ def _step_back(messages, steps, minimum, outside):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _forward(states, z, numbers, level, most, steps, change, images):  # type: ignore[no-untyped-def]
+def _forward(  # type: ignore[no-untyped-def]
+    states, z, numbers, level, most, steps, change, images
+):
     """
     Return the states (images, V, m) of the latest images, and factors (later, m), L / c.
 
@@ -545,7 +549,9 @@ def _forward(states, z, numbers, level, most, steps, change, images):  # type: i
 
 
 @kernel
-def smooth(states, z, numbers, level, most, steps, change, leave, enter, is_end, images):  # type: ignore[no-untyped-def]
+def smooth(  # type: ignore[no-untyped-def]
+    states, z, numbers, level, most, steps, change, leave, enter, is_end, images
+):
     """
     Return the probability of each column of a region for the latest images, (images, m).
 

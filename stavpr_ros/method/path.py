@@ -150,7 +150,9 @@ def _lowest_of_three(row, first, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _best_of_part(memory, rows, low, end, is_first, steps, excluded):  # type: ignore[no-untyped-def]
+def _best_of_part(  # type: ignore[no-untyped-def]
+    memory, rows, low, end, is_first, steps, excluded
+):
     """Return the lowest sum of z of the paths of columns, its column and its speed."""
     images, n, far = len(rows), memory.shape[1], F(FAR)
     before, behind = max(-steps[-1, 0], 0), max(steps[-1, -1], 0)  # of the largest speed

@@ -283,7 +283,7 @@ class FilterWindow(QueryWindow):
 
     @property
     def _middle(self) -> int:
-        """Number of the middle image."""
+        """Return the number of the middle image."""
         return int(self.images['number'][(len(self.images) - 1) // 2])
 
     def match(self) -> WindowMatch:

@@ -54,7 +54,7 @@ class Landmarks:
     motions: np.ndarray
 
     def transform(self, motion: np.ndarray) -> 'Landmarks':
-        """Return the points in another frame, to which this one has the transform (4, 4)."""
+        """Return the points in another frame, by the transform to it, shape (4, 4)."""
         rays, points = (vectors @ motion[:3, :3].T for vectors in (self.rays, self.points))
         return replace(self, points=points + motion[:3, 3], rays=rays)
 
