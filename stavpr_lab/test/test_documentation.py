@@ -156,6 +156,21 @@ def test_snippets_for_other_nodes_are_complete():
     )  # an integer is refused
 
 
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page: its headings, as GitHub names them, and `(NAME)=` lines."""
+    text = re.sub(r'^```.*?^```', '', page.read_text(), flags=re.M | re.S)
+    text = re.sub(r'\[(.*?)\]\(.*?\)', r'\1', text)
+    heads = [re.sub(r'[^\w\- ]', '', head.lower()) for head in re.findall('^#+ (.*)', text, re.M)]
+    return {head.replace(' ', '-') for head in heads} | {*re.findall(r'^\((.*)\)=$', text, re.M)}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_links_to_headings_resolve(page):
+    for target, anchor in re.findall(r'\]\((?!https?://)([^)#\s]*)#([^)\s]+)\)', page.read_text()):
+        path = page.parent / target if target else page
+        assert path.suffix != '.md' or anchor in anchors(path), f'{target}#{anchor}'
+
+
 def marked_tables() -> list:
     """Every table below the name of its rows in tables.json, by page and name."""
     mark = re.compile(r'<!-- tables.json: (.*) -->\n\n((?:\|.*\n)+)')
