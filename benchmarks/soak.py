@@ -38,14 +38,14 @@ def texture_route(count: int) -> Iterator[np.ndarray]:
     return (np.ascontiguousarray(texture[:, s : s + WIDTH]) for s in starts)
 
 
-def make_map(path: Path) -> None:
+def make_map(path: Path, features: str = 'gradient', places: int = PLACES) -> None:
     """Save a map of synthetic images."""
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources.frame import Frame
 
-    frames = (Frame(image, 0, '') for image in texture_route(PLACES))
-    save_map(build_map(frames, FeatureExtractor('gradient'), thumbnails=False), path)
+    frames = (Frame(image, 0, '') for image in texture_route(places))
+    save_map(build_map(frames, FeatureExtractor(features), thumbnails=False), path)
 
 
 def memory(pid: int) -> float:
