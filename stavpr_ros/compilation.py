@@ -19,7 +19,8 @@ from typing import Any
 from llvmlite import binding
 import numba as nb
 from numba.core import event
-from stavpr_ros.kernel_cache import KernelCache
+from numba.core.runtime import nrtdynmod
+from stavpr_ros.kernel_cache import KernelCache, reference_counting
 from stavpr_ros.progress import shows_bars
 from tqdm import tqdm
 
@@ -165,6 +166,7 @@ if CACHE is not None:
         shutil.rmtree(CACHE, ignore_errors=True)  # of an earlier version of the package
     CACHE = of_version
     nb.config.CACHE_DIR = str(CACHE)
+    nrtdynmod.compile_nrt_functions = reference_counting
 
 
 def _decorator(**options: Any) -> Any:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrays whose memory begins with a cache line: vectors across two are read at half the speed."""
 
+import ctypes
 import math
 
 import numpy as np
@@ -30,3 +31,9 @@ def _allocate(allocate, shape, dtype):  # type: ignore[no-untyped-def]
     block = allocate(size + CACHE_LINE, np.uint8)
     first = -block.__array_interface__['data'][0] % CACHE_LINE  # faster than block.ctypes
     return block[first : first + size].view(dtype).reshape(shape)
+
+
+def give_back() -> None:
+    """Give freed memory inside the heap back to the system; glibc keeps it otherwise."""
+    if trim := getattr(ctypes.CDLL(None), 'malloc_trim', None):
+        trim(0)

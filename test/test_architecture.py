@@ -6,6 +6,7 @@ import ast
 from graphlib import TopologicalSorter
 import importlib
 from operator import attrgetter
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -222,9 +223,18 @@ def test_former_field_warns_and_is_the_present_one(kind):
         _ = result.typo
 
 
-def test_import_of_the_package_stays_light():
-    code = "import stavpr_ros, sys; print({'numpy', 'stavpr_ros.api'} & {*sys.modules})"
-    assert subprocess.check_output([sys.executable, '-c', code], text=True) == 'set()\n'
+@pytest.mark.parametrize(
+    ('code', 'unused'),
+    [
+        ('import stavpr_ros', {'numpy', 'stavpr_ros.api'}),
+        ('from stavpr_ros.commands import node; node._import_numba()', {'scipy', 'coverage'}),
+    ],
+)
+def test_imports_stay_light(code, unused):
+    code += f'; import sys; print({unused} & {{*sys.modules}})'
+    variables = {name: os.environ[name] for name in os.environ if not name.startswith('COV_')}
+    run = [sys.executable, '-c', code]
+    assert subprocess.check_output(run, text=True, env=variables) == 'set()\n'
 
 
 # The diagram of the chain in docs/architecture.md

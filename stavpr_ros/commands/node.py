@@ -11,7 +11,8 @@ from stavpr_ros.commands.program import run_node_program
 if TYPE_CHECKING:
     from stavpr_ros.ros.node import PlaceRecognitionNode
 
-BLAS = 'scipy.linalg.cython_blas'  # numba imports it where SciPy is installed
+# what numba imports where it is installed: for matrix products in kernels, and to measure tests
+NOT_NEEDED = 'scipy', 'coverage'
 
 HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
 
@@ -52,9 +53,11 @@ def make_node() -> 'PlaceRecognitionNode':
 
 
 def _import_numba() -> None:
-    """Import numba without SciPy's linear algebra (14 MB) for matrix products in kernels."""
-    if BLAS not in sys.modules:
-        sys.modules[BLAS] = None  # type: ignore[assignment]  # it cannot be imported
-        import numba.np.arraymath  # noqa: F401
+    """Import numba without what no kernel needs (18 MB, 80 modules), unless it is there."""
+    absent = [name for name in NOT_NEEDED if name not in sys.modules]
+    # None = it cannot be imported
+    sys.modules.update(dict.fromkeys(absent))  # type: ignore[arg-type]
+    import numba.np.arraymath  # noqa: F401
 
-        del sys.modules[BLAS]
+    for name in absent:
+        del sys.modules[name]

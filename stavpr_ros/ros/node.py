@@ -20,6 +20,7 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.compilation import progress
 from stavpr_ros.errors import left_out, SettingsError, StavprError
+from stavpr_ros.memory import give_back
 from stavpr_ros.parameters import BY_NAME, RENAMED
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
@@ -191,6 +192,7 @@ class PlaceRecognitionNode(ManagedNode):
         # garbage collector half a second each time, during an image
         gc.collect()
         gc.freeze()
+        give_back()
 
     def _activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.statistics.restart()
@@ -211,6 +213,7 @@ class PlaceRecognitionNode(ManagedNode):
         gc.unfreeze()
         # runtime and worker refer to each other: without it, the map would stay in memory
         gc.collect()
+        give_back()
         if torch := sys.modules.get('torch'):
             torch.cuda.empty_cache()
 
