@@ -42,7 +42,7 @@ help: ## list the targets (the default)
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
-	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
+	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels; none: without'
 	@echo '  EXTRAS="onnx slam"         optional packages: onnx, hdf5, heif, faiss, fleet, ray, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your images, videos, bags or saved maps'
 	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'

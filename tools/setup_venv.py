@@ -30,7 +30,8 @@ LAST_LINES = 25  # of the log of a failed command
 
 # Names of files requirements/NAME.txt. tools/lock_requirements.py makes requirements/locked of
 # them: base.txt, and a file for each extra. Those are installed, and their hashes compared.
-# torch is not locked: its builds depend on the index.
+# torch is not locked: its builds depend on the index; NO_TORCH in its place = without torch.
+NO_TORCH = 'none'
 BASE = ('runtime', 'ros', 'build')
 LOCKED_EXTRAS = (
     'onnx', 'learned', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench',
@@ -217,7 +218,8 @@ def install(extras: list, torch_index: str) -> None:
             run_logged('venv', 'Creating .venv', command)
         index = ['--index-url', place['torch_index']] if place['torch_index'] else []
         title = ' '.join(['Installing torch', *(['from', place['torch_index']] if index else [])])
-        run_logged('torch', title, [*pip, *index, '-r', torch])
+        if place['torch_index'] != NO_TORCH:
+            run_logged('torch', title, [*pip, *index, '-r', torch])
         options = [part for file in files for part in ('-r', file)]
         title = f'Installing {", ".join(locked)}: a few minutes the first time'
         # The files name every package; pip before 24 takes NAME[EXTRA] from outside them.

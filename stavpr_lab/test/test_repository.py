@@ -60,6 +60,12 @@ def test_extras_are_added_and_kept(recorder):
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
 
 
+def test_torch_is_left_out_and_stays_out(recorder):
+    assert recorder.run('setup', '--torch-index', 'none') == ['venv', 'pip']
+    assert recorder.run('setup', '--with', 'dev') == ['pip']
+    assert recorder.run('setup', '--torch-index', 'https://a') == ['venv', 'torch', 'pip']
+
+
 # The public API equals the stored list: a change of a promised name is visible in review
 
 
