@@ -7,13 +7,14 @@ import fcntl
 import math
 import os
 import socket
+import subprocess
 
 import cv2
 from evaluation_commands import write_images
 from map_examples import VERSION2
 import numpy as np
 from PIL import Image
-from processes import SECOND
+from processes import environment, executable, SECOND, TIMEOUT
 import pytest
 import rclpy
 from stavpr_lab.commands import demo
@@ -261,6 +262,35 @@ def test_second_demonstration_in_a_folder_is_refused(tmp_path, capsys):
         fcntl.flock(first, fcntl.LOCK_EX)
         assert demo.main(['--output', str(tmp_path)]) == 2
     assert f'another demo writes to {tmp_path}: give another --output' in capsys.readouterr().err
+
+
+NO_TORCH = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] == 'torch':
+            raise ModuleNotFoundError("No module named 'torch'", name=name)
+
+sys.meta_path.insert(0, NoTorch())
+"""
+
+
+@pytest.mark.parametrize('features', ['gradient', 'hybrid'])
+def test_demo_needs_no_torch_in_any_of_its_processes(tmp_path, route, features):
+    (tmp_path / 'sitecustomize.py').write_text(NO_TORCH)
+    path = os.pathsep.join([str(tmp_path), os.environ.get('PYTHONPATH', '')])
+    images = str(write_images(tmp_path / 'images', route))
+    options = ['--map', images, '--query', images, '--truth', 'identity', '--output', 'output']
+    done = subprocess.run(
+        [executable('demo'), *options, '--features', features],
+        cwd=tmp_path, env=environment() | {'PYTHONPATH': path}, timeout=3 * TIMEOUT,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    matches = (tmp_path / 'output' / 'matches.jsonl').read_text().splitlines()
+    assert len(matches) == len(route)
+    assert '"status": "MATCH"' in matches[-20]
 
 
 # Teach and repeat in the simulator: a short lap, a covered camera, another route
