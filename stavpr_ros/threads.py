@@ -5,7 +5,6 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
-import ctypes
 from functools import cache
 import os
 import sys
@@ -14,7 +13,6 @@ from typing import TypeVar
 import warnings
 
 Result = TypeVar('Result')
-ARENA_MAX = -8  # as malloc.h of glibc numbers it
 _limits = [0]  # the last one set
 
 
@@ -31,18 +29,6 @@ def wait_passively() -> None:
     warnings.filterwarnings('ignore', '.*Could not obtain multiprocessing lock')
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
-
-def share_heap() -> None:
-    """
-    Let all threads allocate in one heap of glibc; before they start.
-
-    Each of a node's twenty has one of its own otherwise, with gaps that no other fills. A choice
-    that the user has made (MALLOC_ARENA_MAX) stays.
-    """
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
-    if mallopt and 'MALLOC_ARENA_MAX' not in os.environ:
-        mallopt(ARENA_MAX, 1)
 
 
 def limit_threads(count: int) -> None:

@@ -21,7 +21,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 from stavpr_ros.errors import printable, SettingsError, StavprError, UnavailableError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.signals import obey_signals, run_until_signal, was_interrupted
-from stavpr_ros.threads import share_heap, wait_passively
+from stavpr_ros.threads import wait_passively
 
 DONE, FAILED, BAD_USAGE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
 
@@ -215,7 +215,6 @@ def run_node_program(text: str, module: str, node: str, args: list[str] | None) 
     arguments = sys.argv[1:] if args is None else args
     wrap = partial(textwrap.fill, width=99, initial_indent=' ' * 6, subsequent_indent=' ' * 6)
     wait_passively()
-    share_heap()
 
     def run() -> int:
         content = import_module(module)
