@@ -80,9 +80,9 @@ STAGES = {
 
 
 def seconds_of(pid: int) -> float:
-    """Return the processor time of a process, with the times of the system."""
+    """Return the processor time of a process and of its ended ones, with the system's."""
     fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+    return sum(map(int, fields[11:15])) / os.sysconf('SC_CLK_TCK')
 
 
 def proportional_memory(pid: int) -> float:

@@ -22,7 +22,7 @@ from typing import Any
 
 from cost import process, seconds_of
 from results import table
-from soak import about, image_message, make_map, texture_route
+from soak import about, image_message, make_map, memory, texture_route
 
 RATE, IMAGES = 10.0, 30  # images per second, and how many after the node has subscribed
 PACKAGES = 5  # packages of the table of imports
@@ -48,8 +48,9 @@ def start(path: str, kernels: str) -> dict[str, Any]:
     Start the node, and show it images.
 
     :param kernels: folder of compiled kernels.
-    :returns: wall and processor time until it has subscribed, s; the kernels that it compiled
-        until then, and later; processor time of an image, ms.
+    :returns: wall and processor time, with that of its processes, until it has subscribed, s; the
+        kernels that were compiled until then, and later; processor time of an image, ms; resident
+        memory at the end, MB.
     """
     import rclpy
     from sensor_msgs.msg import Image
@@ -77,10 +78,11 @@ def start(path: str, kernels: str) -> dict[str, Any]:
                 publisher.publish(message)
                 time.sleep(1 / RATE)
             later = 1e3 * (seconds_of(node) - used) / IMAGES
+            resident = memory(node)
     counts.append(count_kernels())
     return {
         'wall_s': wall, 'processor_s': used, 'kernels': counts[1] - counts[0],
-        'kernels_later': counts[2] - counts[1], 'image_ms': later,
+        'kernels_later': counts[2] - counts[1], 'image_ms': later, 'resident_mb': resident,
     }  # fmt: skip
 
 
