@@ -271,12 +271,17 @@ def test_loaded_kernels_need_neither_optimizer_nor_bitcode_but_callers_do(tmp_pa
 
 FIRST = """
 import sys
+import numpy as np
 from numba.core import event
+from stavpr_ros.compilation import CACHE
+from stavpr_ros.mapping.keyframes import small_gray
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 from stavpr_ros.pipeline.first_start import compile_beside
 
 path, precision = sys.argv[1:]
 settings, lines = PipelineSettings(backend='cpu', precision=precision), []
+small_gray(np.zeros((48, 64, 3), np.uint8))  # something is compiled, as by build_map
+assert any(CACHE.iterdir())
 for path_now, is_over in (('none', False), (path, True), (path, False), (path, False)):
     compile_beside(settings, path_now, lines.append, lambda: is_over)
     print(len(lines), end=' ')
