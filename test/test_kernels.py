@@ -18,7 +18,6 @@ import pytest
 from stavpr_ros import compilation, kernel_cache
 from stavpr_ros.commands import warm
 from stavpr_ros.compilation import cache_folder, kernel, KERNELS
-from stavpr_ros.mapping import save_map
 
 
 @pytest.fixture
@@ -267,38 +266,6 @@ def test_loaded_kernels_need_neither_optimizer_nor_bitcode_but_callers_do(tmp_pa
         '[3, 2, 1, 0]\n2 0\n',
         '[3, 2, 1, 0]\n2 1\n',  # a cache of numba in the same process
     ]
-
-
-FIRST = """
-import sys
-import numpy as np
-from numba.core import event
-from stavpr_ros.compilation import CACHE
-from stavpr_ros.mapping.keyframes import small_gray
-from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
-from stavpr_ros.pipeline.first_start import compile_beside
-
-path, precision = sys.argv[1:]
-settings, lines = PipelineSettings(backend='cpu', precision=precision), []
-small_gray(np.zeros((48, 64, 3), np.uint8))  # something is compiled, as by build_map
-assert any(CACHE.iterdir())
-for path_now, is_over in (('none', False), (path, True), (path, False), (path, False)):
-    compile_beside(settings, path_now, lines.append, lambda: is_over)
-    print(len(lines), end=' ')
-compiled = event.RecordingListener()
-event.register('numba:compile', compiled)
-Pipeline(settings).change(loaded=read_map(path, settings))
-print(len(compiled.buffer))
-"""
-
-
-@pytest.mark.parametrize('precision', ['float32', 'int8'])
-def test_first_start_on_a_map_compiles_nothing_in_its_own_process(tmp_path, small_map, precision):
-    save_map(small_map, tmp_path / 'map.stavpr')
-    run = [sys.executable, '-c', FIRST, str(tmp_path / 'map.stavpr'), precision]
-    variables = environment() | {'NUMBA_CACHE_DIR': str(tmp_path / 'kernels')}
-    printed = subprocess.check_output(run, env=variables, text=True, timeout=2 * TIMEOUT)
-    assert printed == '0 1 2 2 0\n'  # no map; given up; compiled; there
 
 
 COUNTED = """

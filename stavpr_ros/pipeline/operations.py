@@ -535,7 +535,7 @@ class RouteCloser(Operation):
         lap = _noise(extractor.extract([BLANK_IMAGE]), settings.sequence.length + WARM_IMAGES)
         closer = _loop_closer(settings, 1, extractor)
         for _ in range(2):
-            warm_up(closer, lap)
+            _warm_up(closer, lap)
         self.places = GrowingMap(
             extractor.settings,
             extractor.projection,
@@ -569,7 +569,7 @@ def _map_recognizer(
     images = _noise(extractor.extract([BLANK_IMAGE]), count)
     if isinstance(recognizer, PlaceRecognizer):  # images of the map match it
         images, of_map = place_map.features[:count], place_map
-    warm_up(recognizer, images, of_map)
+    _warm_up(recognizer, images, of_map)
     return recognizer
 
 
@@ -606,7 +606,7 @@ def _noise(features: LocalFeatures, count: int) -> LocalFeatures:
     return replace(features, strips=strips, weights=np.repeat(features.weights, count, axis=-1))
 
 
-def warm_up(
+def _warm_up(
     recognizer: SequenceRecognizer, images: LocalFeatures, place_map: Map | None = None
 ) -> None:
     """

@@ -14,7 +14,6 @@ from stavpr_msgs.msg import MapInfo
 from stavpr_ros.mapping import GrowingMap
 from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
-from stavpr_ros.pipeline.first_start import compile_beside
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
     close_journals,
@@ -107,9 +106,6 @@ class Runtime:
         # a node that only localizes on a map that is named has recorded nothing
         is_own = settings.operation != 'localization' or not settings.map_path
         recovery = recover_maps(self._journal_target, log, is_own or bool(settings.save_path))
-        if settings.operation == 'localization':
-            is_over = self._node.ending.is_set
-            compile_beside(settings.pipeline, settings.map_path, log.info, is_over)
         self._pipeline = self.worker.run(self._make_pipeline)
         # a route of loop closure does not continue a map
         start_map = recovery if settings.operation != 'loop_closure' else ''
