@@ -10,8 +10,8 @@ from stavpr_ros.commands.stavpr import main
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import decision
-from stavpr_slam.pose_graph import graph as graph_module
+from stavpr_slam.pose_graph import blocks
+from stavpr_slam.pose_graph.blocks import _Blocks as Blocks
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges, reversed_edge
 from test_pose_graph import error
 
@@ -77,46 +77,29 @@ def test_closures_of_a_g2o_file_correct_its_odometry(tmp_path, freedom, false):
     assert graph.accepted == pytest.approx(48 * (1 - false), abs=12 * false)
 
 
-@pytest.mark.parametrize('precise', [decision.PRECISE, decision.TIGHT])
-def test_errors_that_a_file_states_too_large_are_recognized(tmp_path, monkeypatch, precise):
+@pytest.mark.parametrize('stated', [60.0, 1 / 3])
+@pytest.mark.parametrize('searched', [True, False])
+def test_errors_that_a_file_states_wrong_are_recognized(tmp_path, monkeypatch, stated, searched):
     """At deviations of 3 m and a radian, false closures agree with a path that they bend."""
-    monkeypatch.setattr(decision, 'PRECISE', precise)
-    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', 3, 0.5, 60.0)))
+    if not searched:
+        monkeypatch.setattr(blocks, 'FACTORS', np.ones(1))
+    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', 3, 0.5, stated)))
     found = to_poses(graph.update(final=True))
     right = error(found, to_poses(truth(3))) < 0.2 and graph.accepted == 21
-    assert right == (precise < decision.TIGHT)
+    assert right == searched
+    assert not searched or graph.scales[0] == pytest.approx(1 / stated, rel=0.5)
 
 
-@pytest.mark.parametrize('kept', [decision.KEPT, 0.0])
-def test_closures_with_the_errors_that_a_file_states(data_folder, monkeypatch, kept):
-    """The odometry of the first half of intel alone has smaller errors than the file states."""
-    monkeypatch.setattr(decision, 'KEPT', kept)
-    edges = read_edges(str(data_folder / 'pose_graphs/intel.g2o'))
-    graph = graph_of([edge for edge in edges if max(edge[:2]) <= 900])
-    graph.update(final=True)
-    assert (graph.accepted == 387) == (kept > 0)
-
-
-def test_closures_that_agree_or_contradict_need_no_decision(tmp_path, monkeypatch):
-    """All are decided on where their number has grown by half."""
+def test_closures_that_come_one_at_a_time_are_those_of_the_whole(tmp_path):
     edges = read_edges(write(tmp_path / 'a.g2o', 3, 0.5))
     whole = graph_of(edges)
     whole.update(final=True)
     odometry, closures = edges[: COUNT - 1], edges[COUNT - 1 :]
-    decided, decide = [], graph_module.decided
-
-    def recorded(chain, closures, measured, scales=None):
-        decided.append(scales is None)
-        return decide(chain, closures, measured, scales)
-
-    monkeypatch.setattr(graph_module, 'decided', recorded)
     graph = graph_of([*odometry, *closures[:12]])
     graph.update()
     for each in graph_of(edges)._pending[12:]:
         graph.add_closure(each)
         graph.update()
-    assert decided.count(True) <= 5
-    assert len(decided) < 12
     assert [each.accepted for each in graph.edges] == [each.accepted for each in whole.edges]
 
 
@@ -228,43 +211,58 @@ def test_edges_are_rigid_motions(tmp_path):
     np.testing.assert_allclose(matrices(to_poses(motion)), motion)
 
 
-@pytest.mark.parametrize('dropped', [decision.DROPPED, 0])
-def test_closure_that_bends_the_odometry_is_less_probable_than_a_place_anywhere(
-    data_folder, monkeypatch, dropped
-):
-    """With 9 false closures at random, one agrees with a path that it bends."""
-    monkeypatch.setattr(decision, 'DROPPED', dropped)
-    edges = read_edges(str(data_folder / 'pose_graphs/MIT.g2o'))
+def with_false(folder, name: str, share: float, group: int, seed: int, near: int = 0):
+    """
+    Return a graph of the papers with false closures, and how many of its closures are right.
+
+    :param group: successive nodes of false closures with one motion.
+    :param near: nodes that their ends are apart at most; 0 = any.
+    """
+    edges = read_edges(str(folder / f'pose_graphs/{name}.g2o'))
     right = [edge for edge in edges if edge[1] != edge[0] + 1]
-    nodes, dice = max(edge[1] for edge in edges) + 1, np.random.default_rng(2)
-    false, information = [], np.median([edge[3] for edge in right], axis=0)
-    while len(false) < 9:
-        i, j = dice.integers(0, nodes - 1, 2).tolist()
+    nodes, dice = max(edge[1] for edge in edges) + 1, np.random.default_rng(seed)
+    count, false = round(len(right) * share / (1 - share)), []
+    information = np.median([edge[3] for edge in right], axis=0)
+    while len(false) < count:
+        i, j = dice.integers(0, nodes - group, 2).tolist()
+        if near:
+            j = int(np.clip(i + dice.integers(-near, near), 0, nodes - group - 1))
         if abs(i - j) >= 3:
-            false.append((i, j, right[dice.integers(len(right))][2], information))
-    graph = graph_of([*edges, *false])
-    graph.update(final=True)
-    accepted = np.array([edge.accepted for edge in graph.edges])
-    assert accepted[: len(right)].mean() > 0.9
-    assert accepted[len(right) :].any() == (dropped == 0)
+            motion = right[dice.integers(len(right))][2]
+            made = range(min(group, count - len(false)))
+            false += [(i + k, j + k, motion, information) for k in made]
+    return graph_of([*edges, *false]), len(right)
 
 
-@pytest.mark.parametrize('near', [True, False])
-def test_solutions_begin_near_those_of_a_tighter_odometry(data_folder, monkeypatch, near):
-    """With 30 % of false closures in groups of ten, the odometry alone leads away from them."""
-    if not near:
-        at = decision.Decider.at
-        monkeypatch.setattr(decision.Decider, 'at', lambda *args: at(*args[:3]))
-    edges = read_edges(str(data_folder / 'pose_graphs/manhattan.g2o'))
-    edges = [edge for edge in edges if max(edge[:2]) < 1200]
-    right = [edge for edge in edges if edge[1] != edge[0] + 1]
-    false, dice = [], np.random.default_rng(9)
-    for _ in range(len(right) * 3 // 70):
-        i, j = dice.integers(0, 1190, 2).tolist()
-        motion = right[dice.integers(len(right))][2]
-        false += [(i + k, j + k, motion, right[0][3]) for k in range(10)]
-    graph = graph_of([*edges, *false])
-    graph.update(final=True)
-    accepted = np.array([edge.accepted for edge in graph.edges])
-    assert (accepted[: len(right)].mean() > 0.84) == near
-    assert accepted[len(right) :].any() != near
+def kept(blocks, network, information, values, agree, own):
+    """Return closures as they are."""
+    return agree, values
+
+
+CASES = {  # of a rule: a graph that is wrong without it, and what replaces the rule
+    'certain closures first': ('MIT', 0.1, 10, 0, 0, blocks, 'CERTAIN', 0.0),
+    'rejected ones that may agree by now': ('MIT', 0.3, 1, 2, 0, blocks, 'PASSES', 1),
+    'those less probable than a place anywhere': ('MIT', 0.5, 1, 0, 0, Blocks, '_certain', kept),
+    'weak ones that leave for others': ('MIT', 0.3, 1, 0, 0, Blocks, '_swapped', kept),
+    'one of ten nodes shows the factor': (
+        'MIT', 0.5, 10, 1, 40, Blocks, '_apart', lambda blocks, numbers: numbers,
+    ),
+    'blocks by time': ('MIT', 0.3, 1, 2, 0, blocks, 'BLOCKS', 1),
+    'four times the limit': ('parking-garage', 0.1, 1, 0, 0, blocks, 'NEAR', 1.0),
+    'the factor on all errors': ('intel', 0.5, 10, 0, 0, blocks, 'FACTORS', np.ones(1)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('rule', CASES)
+def test_each_rule_of_blocks_has_a_graph_that_is_wrong_without_it(data_folder, monkeypatch, rule):
+    name, share, group, seed, near, *replaced = CASES[rule]
+    results = []
+    for is_used in (True, False):
+        if not is_used:
+            monkeypatch.setattr(*replaced)
+        graph, right = with_false(data_folder, name, share, group, seed, near)
+        graph.update(final=True)
+        accepted = np.array([edge.accepted for edge in graph.edges])
+        results.append(accepted[:right].mean() - accepted[right:].sum())
+    assert results[0] > 0.96
+    assert results[1] < results[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.solver import Solver
+from stavpr_slam.pose_graph.solver import Solver, squares
 
 PLANAR, SPATIAL = np.array([3, 4, 2]), np.arange(6)
 N = 12
@@ -91,7 +91,7 @@ def test_deviations_are_by_the_errors_of_both_ends(at):
         own = J[f * len(at) : (f + 1) * len(at)]
         spread = np.linalg.inv(information[f]) + own @ poses_covariance @ own.T
         expected.append(errors[f] @ np.linalg.solve(spread, errors[f]))
-    found = solver.deviations(N, weights, chosen)
+    found = squares(solver.innovations(N, weights, chosen))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 

@@ -22,14 +22,12 @@ from stavpr_slam.pose_graph.network import Network
 # Chosen on KITTI 00 and 08 and a world of the demonstration; docs/slam.md has half and double.
 TIGHT = 0.125  # factor on the errors of the odometry that it is trusted by at first
 SCALES = TIGHT * 2.0 ** np.arange(6)  # those that evidence can loosen it to: up to 4
-PRECISE = TIGHT / 16  # the smallest one of a solution; for measured graphs, by evidence
+PRECISE = TIGHT / 16  # the smallest one of a solution
 CERTAIN = math.log(20)  # evidence from which a correction is published
 LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
 DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
 AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
-MAX_TRIED = 50  # closures that are tried one by one
-KEPT = 0.9  # of the closures, by an estimate with smaller errors than a file states
-DROPPED = 20  # that deviate most and are left out one by one
+GROWN = 1.1  # times the closures of the last search: it is made anew
 STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
 GAP = 15.0  # meters that queries and places of an event are apart at most
 FAR = 1e9  # meters between two sessions
@@ -52,6 +50,18 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
     graph = coo_matrix((np.ones(len(near)), near.T), (len(at),) * 2)
     numbers: np.ndarray = connected_components(graph, directed=False)[1]
     return numbers
+
+
+def room(nodes: np.ndarray, freedom: int) -> float:
+    """
+    Return the logarithm of the poses of a map, by a normal density's constant.
+
+    :param nodes: transforms, (N, 4, 4).
+    :param freedom: of poses, 3 or 6.
+    """
+    size = np.maximum(np.sort(np.ptp(nodes[:, :3, 3], axis=0)), 1.0)
+    space = size[1:].prod() * 2 * math.pi if freedom == 3 else size.prod() * 8 * math.pi**2
+    return math.log(space) - freedom / 2 * math.log(2 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,25 +110,15 @@ class Decision:
 class Decider:
     """Decides on the closures of a network."""
 
-    def __init__(
-        self, chain: KeyframeChain, network: Network, initial: np.ndarray, measured: bool
-    ) -> None:
-        self._chain, self._network, self._measured = chain, network, measured
+    def __init__(self, chain: KeyframeChain, network: Network, initial: np.ndarray) -> None:
+        self._chain, self._network = chain, network
         self._start = network.values(initial)
-        count = len(network.query)
-        self._events = (
-            np.arange(count) if measured else events(chain, network.query, network.place)
-        )
-        size = np.maximum(np.sort(np.ptp(initial[:, :3, 3], axis=0)), 1.0)
-        space = size[1:].prod() * 2 * math.pi
-        if network.freedom == 6:
-            space = size.prod() * 8 * math.pi**2
-        self._room = math.log(space) - network.freedom / 2 * math.log(2 * math.pi)
+        self._events = events(chain, network.query, network.place)
+        self._room = room(initial, network.freedom)
 
     def information(self, scales: np.ndarray) -> np.ndarray:
         """Return the information of all factors at factors on the errors of each robot."""
-        closures = float(scales.min()) if self._measured else 1.0
-        return self._network.odometry(scales[self._chain.robot], closures)
+        return self._network.odometry(scales[self._chain.robot])
 
     def representatives(self, taken: np.ndarray) -> np.ndarray:
         """Return the closure in the middle of each event, (m,)."""
@@ -148,13 +148,7 @@ class Decider:
 
         :param counted: closures that count, shape (n,), bool.
         """
-        network, own = self._network, np.flatnonzero(counted)
-        values, squared, determinant = network.solve(information, values, counted * 1.0)
-        whole = np.concatenate([np.ones(len(values), bool), counted])
-        known = float(np.linalg.slogdet(information[whole])[1].sum()) / 2
-        evidence = known - determinant - squared / 2 + len(own) * self._room
-        # a session may begin anywhere in the same space
-        return values, evidence - network.joined(own) * (self._room + network.loose_determinant)
+        return self._network.fit(information, counted, values, self._room)
 
     def _evidence(self, information: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
         """Return the evidence of closures, of which one of each event counts."""
@@ -174,61 +168,22 @@ class Decider:
         rest = len(taken) - np.cumsum(sizes) + sizes
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
-    def _improved(
-        self, information: np.ndarray, taken: np.ndarray, values: np.ndarray, adds: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Add and leave out closures, one by one, where that is evidence.
-
-        A false closure with a large deviation agrees with many paths, and bends the odometry: it
-        is less probable than a place anywhere on the map. A right one at the end of a long path is
-        far away before others are added.
-
-        :param adds: closures in the order of the drive, unless there are many.
-        """
-        network, changed = self._network, True
-        latest = np.maximum(network.query, network.place)
-        values, evidence = self.fit(information, taken, values)
-        while changed:
-            changed, away = False, network.residuals(information, values)
-            rejected, deviating = np.flatnonzero(~taken), np.flatnonzero(taken)
-            rejected = rejected[: len(rejected) * (adds and len(rejected) <= MAX_TRIED)]
-            rejected = rejected[np.argsort(latest[rejected])]
-            deviating = deviating[np.argsort(-away[deviating])][:DROPPED]
-            for number in [*rejected, *deviating]:
-                other = taken.copy()
-                other[number] = not taken[number]
-                moved, found = self.fit(information, other, values)
-                if found > evidence:
-                    taken, values, evidence, changed = other, moved, found, True
-        return taken, values
-
-    def at(
-        self, scales: np.ndarray, thorough: bool = False, tighter: Decision | None = None
-    ) -> Decision:
+    def at(self, scales: np.ndarray) -> Decision:
         """
         Decide with an odometry.
 
         :param scales: factors on its errors, of each robot.
-        :param thorough: closures of a measured graph are added and left out one by one.
-        :param tighter: decision with a tighter odometry, at which a solution begins as well.
         """
         network = self._network
         information = network.odometry(scales[self._chain.robot])
         none, start = np.zeros(len(network.query), bool), self._start
         try:
             taken, values = network.robust(information, start)
-            tried, evidence = [], self._evidence(information, taken, values)
+            evidence = self._evidence(information, taken, values)
             if taken.any():  # closures beside them may agree by now
-                tried.append(network.robust(information, values, AGAIN))
-            if tighter:
-                tried.append(network.robust(information, tighter.values, AGAIN))
-            if thorough:
-                begins = *tried, (none, start)
-                tried += [self._improved(information, *each, True) for each in begins]
-            for more, moved in tried:
+                more, moved = network.robust(information, values, AGAIN)
                 found = self._evidence(information, more, moved)
-                if found > evidence and (self._measured or more.sum() > taken.sum()):
+                if found > evidence and more.sum() > taken.sum():
                     taken, values, evidence = more, moved, found
         except np.linalg.LinAlgError:
             return Decision(scales, none, start, -math.inf)
@@ -251,12 +206,8 @@ class Decider:
 
         best = self.at(np.full(robots, TIGHT))
         tried = [best]
-        if self._measured:
-            best = better(best, self.at(np.full(robots, PRECISE)))
-        for scale in SCALES[1 : 4 if self._measured else None]:
-            thorough = self._measured and scale >= 1
-            tighter = tried[-1] if self._measured else None
-            tried.append(self.at(np.full(robots, scale), thorough, tighter))
+        for scale in SCALES[1:]:
+            tried.append(self.at(np.full(robots, scale)))
             best = better(best, tried[-1])
             if best.is_published and all(
                 each.evidence < best.evidence - LOOSENED for each in tried[-2:]
@@ -269,25 +220,15 @@ class Decider:
         return best, tried
 
     def estimate(
-        self, decision: Decision, independent: np.ndarray, searches: bool
+        self, decision: Decision, independent: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
         Estimate the variables at the errors of the odometry that the closures show.
 
         :param independent: as in :meth:`counted`.
-        :param searches: leave out closures that are less probable than a place anywhere.
         :returns: the factors on the errors of each robot, the variables, and the closures that
             count, shape (n,), bool.
         """
-        if self._measured:
-            for scales in (decision.scales / TIGHT).clip(max=1.0), np.ones_like(decision.scales):
-                information = self.information(scales)
-                taken, values = self._network.robust(information, decision.values, AGAIN)
-                if taken.sum() >= KEPT * decision.taken.sum():
-                    break
-            if searches:
-                taken, values = self._improved(information, taken, values, False)
-            return scales, values, taken
         counted = self.counted(decision.taken, independent)
 
         def fitted(factor: float) -> tuple[float, float, np.ndarray]:

@@ -12,8 +12,9 @@ from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks
+from stavpr_slam.pose_graph.blocks import added
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
-from stavpr_slam.pose_graph.decision import events, TIGHT
+from stavpr_slam.pose_graph.decision import events, GROWN, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extended
@@ -21,8 +22,6 @@ from stavpr_slam.pose_graph.solution import decided, followed, NOTHING, Solution
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-GROWN = 1.1  # factor on the number of closures from which scales and breaks are searched anew
-GROWN_MEASURED = 1.5  # the same of scales in measured graphs
 MAX_BREAKS = 4  # that are searched
 
 
@@ -183,7 +182,7 @@ class PoseGraph:
         last = self._solution
         solved = len(last.accepted)
         if not final and len(self._known) == solved:
-            nodes = extended(self.chain, last.nodes, last.placement.links)
+            nodes = extended(self.chain, last.nodes, last.placement)
             self._solution = replace(last, nodes=nodes)
             return self.solved
         try:
@@ -196,14 +195,15 @@ class PoseGraph:
         return self.solved
 
     def _solve(self, final: bool) -> Solution:
-        last, given = self._solution, (self.chain, self._closures, self.settings.measured)
-        grown = GROWN_MEASURED if self.settings.measured else GROWN
-        if not final and len(self._known) <= grown * self._searched:
+        last, given = self._solution, (self.chain, self._closures)
+        if self.settings.measured:
+            return added(*given, NOTHING if final else last)
+        if not final and len(self._known) <= GROWN * self._searched:
             return followed(*given, last) or decided(*given, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
         found = without = self._decided()
-        for _ in range(0 if self.settings.measured else MAX_BREAKS):
+        for _ in range(MAX_BREAKS):
             better = self._with_break(found)
             if better is None:
                 break
@@ -217,7 +217,7 @@ class PoseGraph:
         return found
 
     def _decided(self) -> Solution:
-        return decided(self.chain, self._closures, self.settings.measured)
+        return decided(self.chain, self._closures)
 
     def _split(self, node: int, begins: bool) -> None:
         """Begin a session at a node, or end it; closures between it and the one before change."""

@@ -3,6 +3,7 @@
 """Keyframes of the odometry, and the sessions between its breaks."""
 
 from bisect import bisect_right
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -87,6 +88,12 @@ class KeyframeChain:
         if name.startswith('_') or name not in (self._nodes.dtype.names or ()):
             raise AttributeError(name)
         return self._nodes[name][: self._count]
+
+    def until(self, count: int) -> 'KeyframeChain':
+        """Return the first nodes alone, which share their arrays with these."""
+        part = copy(self)
+        part._count = count
+        return part
 
     def newest(self, robot: str = '') -> int:
         """Return the newest keyframe of a robot; -1 = none."""

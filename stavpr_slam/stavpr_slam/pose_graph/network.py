@@ -119,16 +119,31 @@ class Network:
         """Return the squared deviations of the closures, shape (n,)."""
         return self._solver.squared(values, odometry)[len(values) :]
 
-    def deviations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def innovations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """
-        Return by how much closures would deviate if they counted, squared, shape (n,).
+        Return how closures differ from what the others expect, see :meth:`Solver.innovations`.
 
-        :param weights: of all closures in the solution whose residuals were asked for at last.
-        :param chosen: numbers of n closures that have no weight.
+        At the variables whose residuals were asked for at last.
+
+        :param weights: of all closures in that solution.
+        :param chosen: numbers of n closures.
         """
         before = len(self._variables)
         whole = np.concatenate([np.ones(before), weights])
-        return self._solver.deviations(before, whole, chosen + before)
+        return self._solver.innovations(before, whole, chosen + before)
+
+    def beside_odometry(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the same of closures within sessions beside the odometry as stated alone."""
+        before, at = len(self._variables), self._solver.at
+        spread = self._chain.path_errors(self.query[chosen], self.place[chosen])
+        none = np.zeros(before + len(self.query))
+        return self._solver.innovations(before, none, chosen + before, spread[:, at[:, None], at])
+
+    def joining(self, taken: np.ndarray) -> np.ndarray:
+        """Return which closures join sessions that those that are taken do not join, (n,)."""
+        pairs = np.sort(self._chain.session[np.stack([self.query, self.place])], axis=0)
+        key = pairs[0] * len(self._chain) + pairs[1]
+        return (pairs[0] != pairs[1]) & ~np.isin(key, key[taken])
 
     def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""
@@ -142,7 +157,12 @@ class Network:
         return self._solver.step(values, whole)
 
     def robust(
-        self, odometry: np.ndarray, values: np.ndarray, start: float = 0.0
+        self,
+        odometry: np.ndarray,
+        values: np.ndarray,
+        start: float = 0.0,
+        among: np.ndarray | bool = True,
+        limit: float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
         Decide which closures are right by graduated non-convexity, truncated least squares.
@@ -151,21 +171,24 @@ class Network:
         a step of Gauss and Newton for each parameter; the odometry is right.
 
         :param start: first parameter, where the variables are a solution already.
+        :param among: closures that may be right, shape (n,), bool.
+        :param limit: of squared deviations, another than :attr:`limit`.
         :returns: whether each closure is, shape (n,), and the variables.
         :raises LinAlgError: no solution.
         """
-        weights, limit = np.ones(len(self.query)), self.limit
+        weights, limit = np.ones(len(self.query)) * among, limit or self.limit
         squared = self.residuals(odometry, values)
         for _ in range(0 if start else FIRST_STEPS):
             values, _ = self._step(values, weights)
             squared = self.residuals(odometry, values)
-        if 2 * squared.max(initial=0.0) <= limit:
+        if 2 * (squared * among).max(initial=0.0) <= limit:
             return weights > 0, values
-        mu = start or limit / (2 * squared.max() - limit)
+        mu = start or limit / (2 * (squared * among).max() - limit)
         for _ in range(MAX_STEPS):
             surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
             between = np.sqrt(limit * mu * (mu + 1) / squared.clip(surely)) - mu
             weights = np.where(squared >= never, 0.0, np.where(squared <= surely, 1.0, between))
+            weights *= among
             values, _ = self._step(values, weights)
             if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
                 break
@@ -191,3 +214,20 @@ class Network:
             if abs(before - error) < 2 * CONVERGED:
                 break
         return values, error, determinant
+
+    def fit(
+        self, odometry: np.ndarray, counted: np.ndarray, values: np.ndarray, room: float
+    ) -> tuple[np.ndarray, float]:
+        """
+        Estimate the variables by least squares, and return them and the evidence.
+
+        :param counted: closures that count, shape (n,), bool.
+        :param room: logarithm of the poses of the map.
+        """
+        own = np.flatnonzero(counted)
+        values, squared, determinant = self.solve(odometry, values, counted * 1.0)
+        whole = np.concatenate([np.ones(len(values), bool), counted])
+        known = float(np.linalg.slogdet(odometry[whole])[1].sum()) / 2
+        evidence = known - determinant - squared / 2 + len(own) * room
+        # a session may begin anywhere in the same space
+        return values, evidence - self.joined(own) * (room + self.loose_determinant)

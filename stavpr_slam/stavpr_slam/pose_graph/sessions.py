@@ -93,23 +93,31 @@ def _best(votes: np.ndarray, transforms: np.ndarray) -> int:
     return int(np.argmin(np.quantile(away, AGREEING, axis=1)))
 
 
-def extended(chain: KeyframeChain, solved: np.ndarray, links: dict[int, int]) -> np.ndarray:
+def few(chain: KeyframeChain, closures: ClosureArrays, placement: Placement) -> set[Pair]:
+    """Return the pairs of sessions that too few closures join, of those that are right."""
+    joined = weights(chain, closures)
+    return {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
+
+
+def extended(chain: KeyframeChain, solved: np.ndarray, placement: Placement) -> np.ndarray:
     """
     Return the last estimate, and for later nodes what the odometry adds to it.
 
     :param solved: the last estimate, shape (n, 4, 4).
-    :param links: as in :class:`Placement`.
     :returns: shape (N, 4, 4).
     """
-    T, known = chain.transforms, len(solved)
+    T, known, initial = chain.transforms, len(solved), placement.initial
     result = np.concatenate([solved, T[known:]])
     later = np.arange(len(chain)) >= known
-    for session in set(chain.session[known:].tolist()) - {KeyframeChain.FIXED}:
+    for session in np.unique(chain.session[known:]):
         own = np.flatnonzero((chain.session == session) & later)
-        first, before = own[0], int(chain.previous[own[0]])
-        moved = T[before] if before >= 0 else T[first]
-        if before < 0:
-            before = links.get(int(first), chain.before(int(first)))
+        first, before = int(own[0]), int(chain.previous[own[0]])
+        if session == KeyframeChain.FIXED:
+            continue
         if before >= 0:
-            result[own] = result[before] @ inverse(moved) @ T[own]
+            result[own] = result[before] @ inverse(T[before]) @ T[own]
+        elif 0 <= (link := placement.links.get(first, -1)) < first:
+            result[own] = result[link] @ inverse(initial[link]) @ initial[own]
+        elif (before := chain.before(first)) >= 0:
+            result[own] = result[before] @ inverse(T[first]) @ T[own]
     return result

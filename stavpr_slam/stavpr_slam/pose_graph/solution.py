@@ -3,6 +3,7 @@
 """Solutions of a pose graph: a decision on all closures, or new ones added to the last."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from stavpr_slam.pose_graph.closures import ClosureArrays
@@ -11,13 +12,13 @@ from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.sessions import (
     extended,
-    JOINS,
+    few,
     Pair,
     place,
     Placement,
     session_pairs,
-    weights,
 )
+from stavpr_slam.pose_graph.solver import squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,7 @@ class Solution:
     :param scales: factors on the errors of the odometry of each robot.
     :param tried: robust solutions: nodes, closures that agree, and the strained node; where the
         errors of the odometry were searched.
+    :param beliefs: of a graph of another program, see :mod:`stavpr_slam.pose_graph.blocks`.
     """
 
     nodes: np.ndarray
@@ -39,6 +41,7 @@ class Solution:
     placement: Placement
     decision: Decision
     tried: list[tuple[np.ndarray, np.ndarray, int]]
+    beliefs: Any = None
 
     @property
     def rejected(self) -> int:
@@ -47,12 +50,11 @@ class Solution:
 
 
 def decided(
-    chain: KeyframeChain, closures: ClosureArrays, measured: bool, scales: np.ndarray | None = None
+    chain: KeyframeChain, closures: ClosureArrays, scales: np.ndarray | None = None
 ) -> Solution:
     """
     Decide on all closures anew, and estimate all nodes.
 
-    :param measured: as in :class:`GraphSettings`.
     :param scales: factors on the errors of the odometry of each robot, as decided before; None =
         they are searched.
     """
@@ -61,22 +63,19 @@ def decided(
         placement = place(chain, closures, denied)
         used = closures[placement.allowed]
         network = Network(chain, placement.initial, used, placement.links)
-        decider = Decider(chain, network, placement.initial, measured)
+        decider = Decider(chain, network, placement.initial)
         if scales is None:
             decision, tried = decider.decide(len(chain.robots))
         else:
             decision, tried = decider.at(scales), []
-        joined = weights(chain, used[decision.taken])
-        few = {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
-        if not few:
+        pairs = few(chain, used[decision.taken], placement)
+        if not pairs:
             break
-        denied |= few
+        denied |= pairs
     accepted, found, values = decision.taken, decision.scales, network.values(placement.initial)
     counted = accepted
     if accepted.any():
-        found, values, counted = decider.estimate(decision, used.is_independent, scales is None)
-    if measured:
-        accepted = counted
+        found, values, counted = decider.estimate(decision, used.is_independent)
 
     def among_all(chosen: np.ndarray) -> np.ndarray:
         result = placement.allowed.copy()
@@ -89,9 +88,7 @@ def decided(
     )  # fmt: skip
 
 
-def followed(
-    chain: KeyframeChain, closures: ClosureArrays, measured: bool, last: Solution
-) -> Solution | None:
+def followed(chain: KeyframeChain, closures: ClosureArrays, last: Solution) -> Solution | None:
     """
     Add new closures to the last solution, each of which agrees with it or contradicts it.
 
@@ -107,12 +104,12 @@ def followed(
     pairs = session_pairs(chain, closures[known:]).tolist()
     if any(a != b and (a, b) not in placement.pairs for a, b in pairs):
         return None
-    nodes = extended(chain, last.nodes, placement.links)
+    nodes = extended(chain, last.nodes, placement)
     number = np.arange(len(closures))
     numbers = np.concatenate([np.flatnonzero(last.accepted), number[known:]])
     used, first = closures[numbers], len(numbers) - len(closures) + known
     network = Network(chain, nodes, used, placement.links)
-    decider = Decider(chain, network, nodes, measured)
+    decider = Decider(chain, network, nodes)
     information, values = decider.information(last.scales), network.values(nodes)
     agree = (network.residuals(information, values) <= network.limit) | (
         number[: len(used)] < first
@@ -120,9 +117,9 @@ def followed(
     far = np.flatnonzero(~agree)
     if len(far):
         before = np.append(last.counted[last.accepted], np.zeros(len(used) - first))
-        agree[far] = network.deviations(before, far) <= network.limit
+        agree[far] = squares(network.innovations(before, far)) <= network.limit
         network.residuals(decider.information(last.decision.scales), values)
-        if (network.deviations(before, far) > network.limit)[agree[far]].any():
+        if (squares(network.innovations(before, far)) > network.limit)[agree[far]].any():
             return None
     own = decider.counted(agree, used.is_independent)
     values, _ = decider.fit(information, own, values)

@@ -22,6 +22,7 @@ SERIES = 1e-2  # radians: the same of the derivative of the logarithm
 SPARE = 1.5  # times the active factors: a pattern of so many is used again
 FILLED = 6  # blocks for each active factor: a pattern with more is used again for 2 % more only
 PATTERNS = 16  # that are kept
+ALONE = 1e-9  # least part of its errors that a factor leaves to others
 
 
 @kernel
@@ -273,6 +274,19 @@ def _forward(starts, rows, blocks, first, x):
 
 
 @kernel
+def _forward_block(starts, rows, blocks, j, x):
+    """Solve a column of the lower half in place for d right sides, x of shape (count, d, d)."""
+    d = x.shape[1]
+    for a in range(d):
+        for k in range(d):
+            for c in range(a):
+                x[j, a, k] -= blocks[starts[j], a, c] * x[j, c, k]
+            x[j, a, k] /= blocks[starts[j], a, a]
+    for p in range(starts[j] + 1, starts[j + 1]):
+        _add(x[rows[p]], -1.0, blocks[p], x[j], False)
+
+
+@kernel
 def _backward(starts, rows, blocks, x):
     """Solve the upper half in place."""
     count, d = x.shape
@@ -317,21 +331,49 @@ def _spread(
     blocks, gradient = np.empty((len(rows), d, d)), np.empty((count, d))
     _assemble(ends, slots, errors, jacobians, information, weights, blocks, gradient)
     determinant = _decompose(starts, rows, blocks)
-    column, x = np.empty(count, np.int64), np.empty((d, count, d))
+    column, x = np.empty(count, np.int64), np.zeros((count, d, d))
     for k in range(count):
         column[order[k]] = k
     for number in range(len(chosen)):
         f = chosen[number]
-        i, j = ends[f]
+        first, second = column[ends[f, 0]], column[ends[f, 1]]
         for a in range(d):
-            x[a], x[a, column[j], a] = 0.0, 1.0
+            x[second, a, a] = 1.0
             for b in range(d):
-                x[a, column[i], b] += jacobians[f, a, b]
-            _forward(starts, rows, blocks, min(column[i], column[j]), x[a])
-        for a in range(d):
-            for b in range(d):
-                result[number, a, b] = (x[a] * x[b]).sum()
+                x[first, b, a] += jacobians[f, a, b]
+        while True:  # the columns that a column fills are those of the ways to the last one
+            j = min(first, second)
+            if j == count:
+                break
+            _forward_block(starts, rows, blocks, j, x)
+            _add(result[number], 1.0, x[j].T, x[j], False)
+            x[j] = 0.0
+            following = rows[starts[j] + 1] if starts[j] + 1 < starts[j + 1] else count
+            first = following if first == j else first
+            second = following if second == j else second
     return determinant
+
+
+def squares(innovations: np.ndarray) -> np.ndarray:
+    """Return the squared deviations of factors, (n,), see :meth:`Solver.innovations`."""
+    errors, variances = np.split(innovations[:, :-1], 2, axis=1)
+    result: np.ndarray = (errors**2 / (1 + variances)).sum(axis=1)
+    return result
+
+
+def likelihoods(innovations: np.ndarray) -> np.ndarray:
+    """Return the logarithms of their densities, but for the constant of a normal one, (n,)."""
+    variances = 1 + np.split(innovations[:, :-1], 2, axis=1)[1]
+    size = innovations[:, -1] + np.log(variances).sum(axis=1)
+    return np.asarray(-(squares(innovations) + size) / 2)
+
+
+def scaled(innovations: np.ndarray, factor: float) -> np.ndarray:
+    """Return innovations where all errors are larger by a factor."""
+    d, result = innovations.shape[1] // 2, innovations.copy()
+    result[:, :d] /= factor
+    result[:, -1] += 2 * d * math.log(factor)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,28 +455,35 @@ class Solver:
             raise np.linalg.LinAlgError('the pose graph has no unique solution')
         return result, determinant
 
-    def deviations(self, count: int, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def innovations(
+        self, count: int, weights: np.ndarray, chosen: np.ndarray, spread: np.ndarray | None = None
+    ) -> np.ndarray:
         """
-        Return the squared deviations of factors that do not count, by the errors of both ends.
-
-        At the poses that were linearized at last; a solution that counted such a factor as well
-        would deviate by as much in all.
+        Return how factors differ from what the others expect, at the poses linearized at last.
 
         :param count: number of poses.
         :param weights: of the factors, (m,).
         :param chosen: n of them, which have a first pose.
-        :returns: shape (n,); NaN = the poses have no unique solution.
+        :param spread: covariances of the motions between their ends, (n, d, d); None = as solved.
+        :returns: in rows of 2 d + 1: errors on axes where they do not correlate, in deviations of
+            the factor, variances of what the others expect there, and the logarithm of the
+            determinant of the covariance of the factor.
         """
-        used, d = self._pattern(weights > 0, count), len(self.at)
-        spread = np.empty((len(chosen), d, d))
-        _spread(
-            self.ends, self._errors, self._jacobians, self._local, weights, self.at, used.order,
-            used.slots, used.starts, used.rows, chosen, spread,
-        )  # fmt: skip
-        errors = self._errors[chosen]
-        inner = np.linalg.inv(np.linalg.inv(self._local[chosen]) + spread)
-        result: np.ndarray = np.einsum('ni,nij,nj->n', errors, inner, errors)
-        return result
+        if spread is None:
+            used, d = self._pattern(weights > 0, count), len(self.at)
+            spread = np.zeros((len(chosen), d, d))
+            _spread(
+                self.ends, self._errors, self._jacobians, self._local, weights, self.at,
+                used.order, used.slots, used.starts, used.rows, chosen, spread,
+            )  # fmt: skip
+        root = np.linalg.cholesky(self._local[chosen])
+        variances, axes = np.linalg.eigh(root.mT @ spread @ root)
+        variances, counts = variances.clip(0), weights[chosen, None] > 0
+        # factors that count have made errors and variances smaller
+        rest = np.where(counts, (1 - variances).clip(ALONE), 1.0)
+        errors = (axes.mT @ (root.mT @ self._errors[chosen, :, None]))[:, :, 0]
+        size = -2 * np.log(np.einsum('nii->ni', root)).sum(axis=1)
+        return np.column_stack([errors / rest, variances / rest, size])
 
     def _pattern(self, active: np.ndarray, count: int) -> Pattern:
         used = active.sum()
@@ -453,4 +502,4 @@ def compile_kernels() -> None:
     solver = Solver(ends, poses.copy(), np.arange(6))
     solver.squared(poses, np.tile(np.eye(6), (count, 1, 1)))
     solver.step(poses, weights)
-    solver.deviations(count, weights, np.array([1]))
+    solver.innovations(count, weights, np.array([1]))
