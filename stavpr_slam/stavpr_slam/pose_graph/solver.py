@@ -227,15 +227,22 @@ def _decompose(starts, rows, blocks):
     """
     count, d = len(starts) - 1, blocks.shape[1]
     head, link, first = np.full(count, -1), np.full(count, -1), starts[:-1].copy()
-    where, determinant = np.zeros(count, np.int64), 0.0
+    where, pivot, determinant = np.zeros(count, np.int64), np.empty((d, d)), 0.0
     for j in range(count):
         for p in range(starts[j], starts[j + 1]):
             where[rows[p]] = p
         k = head[j]
         while k >= 0:  # columns that have a block in this row
             following = link[k]
+            pivot[:] = blocks[first[k]]
             for p in range(first[k], starts[k + 1]):
-                _add(blocks[where[rows[p]]], -1.0, blocks[p], blocks[first[k]].T, False)
+                q = where[rows[p]]
+                for a in range(d):
+                    for b in range(d):
+                        total = 0.0
+                        for c in range(d):
+                            total += blocks[p, a, c] * pivot[b, c]
+                        blocks[q, a, b] -= total
             _queue(k, starts, rows, head, link, first)
             k = following
         determinant += _root(blocks[starts[j]])
@@ -282,8 +289,15 @@ def _forward_block(starts, rows, blocks, j, x):
             for c in range(a):
                 x[j, a, k] -= blocks[starts[j], a, c] * x[j, c, k]
             x[j, a, k] /= blocks[starts[j], a, a]
+    own = x[j].copy()
     for p in range(starts[j] + 1, starts[j + 1]):
-        _add(x[rows[p]], -1.0, blocks[p], x[j], False)
+        r = rows[p]
+        for a in range(d):
+            for k in range(d):
+                total = 0.0
+                for c in range(d):
+                    total += blocks[p, a, c] * own[c, k]
+                x[r, a, k] -= total
 
 
 @kernel
