@@ -3,11 +3,16 @@
 """Steps of the pose graph's solver, beside a dense solution whose derivatives are differences."""
 
 from motions import exponentials, logarithms
+from numba.core import event
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.solver import Solver, squares
+from stavpr_slam.pose_graph.g2o import graph_of as graph_of_file
+from stavpr_slam.pose_graph.g2o import read_edges
+from stavpr_slam.pose_graph.solver import compile_kernels, Solver, squares
+from test_graph_files import write
+from test_pose_graph import circle, closure, LAP, solve
 
 PLANAR, SPATIAL = np.array([3, 4, 2]), np.arange(6)
 N = 12
@@ -114,3 +119,24 @@ def test_pose_without_factors_has_no_solution():
     solver.squared(poses, information)
     with pytest.raises(np.linalg.LinAlgError, match='no unique solution'):
         solver.step(poses, weights)
+
+
+def test_kernels_that_are_compiled_at_build_are_all_of_a_drive_and_a_file(tmp_path):
+    """The first closure of a robot compiles nothing: ``stavpr warm`` has."""
+
+    class Compiled(event.Listener):
+        def on_start(self, event):
+            names.append(event.data['dispatcher'].py_func.__name__)
+
+        def on_end(self, event):
+            """Do nothing."""
+
+    names = list[str]()
+    compile_kernels()
+    with event.install_listener('numba:compile', Compiled()):
+        truth = circle()
+        closures = [closure(truth, q, q - LAP) for q in range(LAP, 2 * LAP)]
+        solve(truth, closures)
+        for freedom in (3, 6):
+            graph_of_file(read_edges(write(tmp_path / 'a.g2o', freedom, 0.3))).update(final=True)
+    assert names == []
