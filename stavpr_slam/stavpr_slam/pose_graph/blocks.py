@@ -29,6 +29,7 @@ WEAKEST = 12  # closures that are left out on trial
 PLAUSIBLE = 50  # rejected closures that are tried in their place
 FACTORS = 2.0 ** np.arange(-13, 5, 0.5)  # on the errors that a file states
 STEPS = 20  # of expectation and maximization
+SHOWN = 4  # right closures that show a factor, at least
 Found = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
 
 
@@ -74,6 +75,8 @@ class Beliefs:
             prior = (right.sum(axis=1, keepdims=True) + 1) / (ratio.shape[1] + 2)
         evidence = np.log(prior * ratio + 1 - prior).sum(axis=1)
         evidence[1:] -= LOOSENED
+        # of a few closures, one that fits by chance would show any factor
+        evidence[1:][right.sum(axis=1)[1:] < SHOWN] = -np.inf
         best = int(np.argmax(evidence))
         self.prior = math.log(prior[best, 0] / (1 - prior[best, 0]))
         return best
@@ -178,7 +181,7 @@ class _Blocks:
             rows[new] = network.innovations(taken, np.flatnonzero(new))
             beliefs.innovations[own] = rows
             if self._searches:
-                beliefs.show(beliefs.innovations[self._apart(own)], FACTORS[FACTORS > 1])
+                beliefs.show(beliefs.innovations[self._apart(own)], 1 / FACTORS[FACTORS < 1])
                 information, rows = self._information(network), beliefs.innovations[own]
             passes = new & (squares(rows) <= network.limit)
             passes &= beliefs.odds(rows) > (0 if number else CERTAIN)

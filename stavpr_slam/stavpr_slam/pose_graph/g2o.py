@@ -27,7 +27,7 @@ ORDER = [3, 4, 5, 0, 1, 2]  # rotation first, or translation
 SIZES = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}  # numbers of a pose, of its information
 NORM_ERROR = 0.1  # of a quaternion in text, of a few digits
 ROUNDING = 1e-12  # of an eigenvalue, in parts of the greatest
-INFORMATION = 1e-6, 1e15  # least and greatest eigenvalue: of 1e3 and 3e-8 m
+INFORMATION = 1e-11, 1e15  # least and greatest eigenvalue: of 3e5 and 3e-8 m
 GAP = 100 * SECOND  # between two sessions
 Edge = tuple[int, int, np.ndarray, np.ndarray]  # start, end, motion (4, 4), information (6, 6)
 
