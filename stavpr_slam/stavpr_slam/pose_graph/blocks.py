@@ -162,7 +162,7 @@ class _Blocks:
 
         :param own: numbers of all closures up to its end.
         :param new: those of them that are new, bool.
-        :param swaps: leave out weak ones on trial.
+        :param swaps: leave out weak ones on trial; without any, take those that agree together.
         """
         beliefs = self._beliefs
         network = Network(part, self._nodes, self._closures[own], self._placement.links)
@@ -194,8 +194,10 @@ class _Blocks:
             if (agree == taken).all():
                 break
             taken = agree
-        if swaps:
+        if swaps and taken.any():
             taken, values = self._swapped(network, information, values, taken, own)
+        elif swaps:
+            taken, values = self._together(network, information, values, own)
         self._taken[own], self._nodes = taken, network.nodes(values)
 
     def _consistent(
@@ -236,6 +238,18 @@ class _Blocks:
             agree = agree & (np.arange(len(agree)) != chosen[np.argmin(odds)])
             values, _, _ = network.solve(information, values, agree * 1.0)
         return agree, values
+
+    def _together(
+        self, network: Network, information: np.ndarray, values: np.ndarray, own: np.ndarray
+    ) -> Found:
+        """Take the closures that agree, most of all, where each alone proves nothing."""
+        taken = np.zeros(len(own), bool)
+        fits = squares(self._beliefs.innovations[own]) <= network.limit
+        agree, moved = self._consistent(network, information, values, fits)
+        _, evidence = network.fit(information, taken, values, self._beliefs.space)
+        moved, found = network.fit(information, agree, moved, self._beliefs.space)
+        is_shown = agree.sum() >= max(SHOWN, len(agree) / 2) and found > evidence
+        return (agree, moved) if is_shown else (taken, values)
 
     def _swapped(
         self, network: Network, information: np.ndarray, values: np.ndarray, taken: np.ndarray,
