@@ -29,6 +29,7 @@ WEAKEST = 12  # closures that are left out on trial
 PLAUSIBLE = 50  # rejected closures that are tried in their place
 FACTORS = 2.0 ** np.arange(-13, 5, 0.5)  # on the errors that a file states
 STEPS = 20  # of expectation and maximization
+NEARLY_ALL = 0.9  # of the closures, that agree together
 SHOWN = 4  # right closures that show a factor, at least
 Found = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
 
@@ -242,13 +243,13 @@ class _Blocks:
     def _together(
         self, network: Network, information: np.ndarray, values: np.ndarray, own: np.ndarray
     ) -> Found:
-        """Take the closures that agree, most of all, where each alone proves nothing."""
+        """Take the closures that agree, nearly all, where each alone proves nothing."""
         taken = np.zeros(len(own), bool)
         fits = squares(self._beliefs.innovations[own]) <= network.limit
         agree, moved = self._consistent(network, information, values, fits)
         _, evidence = network.fit(information, taken, values, self._beliefs.space)
         moved, found = network.fit(information, agree, moved, self._beliefs.space)
-        is_shown = agree.sum() >= max(SHOWN, len(agree) / 2) and found > evidence
+        is_shown = agree.sum() >= max(SHOWN, NEARLY_ALL * len(agree)) and found > evidence
         return (agree, moved) if is_shown else (taken, values)
 
     def _swapped(
