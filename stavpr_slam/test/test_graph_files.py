@@ -242,12 +242,15 @@ def test_edges_are_rigid_motions(tmp_path):
     np.testing.assert_allclose(matrices(to_poses(motion)), motion)
 
 
-def with_false(folder, name: str, share: float, group: int, seed: int, near: int = 0):
+def with_false(
+    folder, name: str, share: float, group: int, seed: int, near: int = 0, alone: bool = False
+):
     """
     Return a graph of the papers with false closures, and how many of its closures are right.
 
     :param group: successive nodes of false closures with one motion.
     :param near: nodes that their ends are apart at most; 0 = any.
+    :param alone: without the right ones.
     """
     edges = read_edges(str(folder / f'pose_graphs/{name}.g2o'))
     right = [edge for edge in edges if edge[1] != edge[0] + 1]
@@ -262,6 +265,8 @@ def with_false(folder, name: str, share: float, group: int, seed: int, near: int
             motion = right[dice.integers(len(right))][2]
             made = range(min(group, count - len(false)))
             false += [(i + k, j + k, motion, information) for k in made]
+    if alone:
+        edges, right = [edge for edge in edges if edge[1] == edge[0] + 1], []
     return graph_of([*edges, *false]), len(right)
 
 
@@ -297,3 +302,17 @@ def test_each_rule_of_blocks_has_a_graph_that_is_wrong_without_it(data_folder, m
         results.append(accepted[:right].mean() - accepted[right:].sum())
     assert results[0] > 0.9
     assert results[1] < results[0]
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+@pytest.mark.parametrize('share', [0.3, 0.5])
+def test_false_closures_nearby_do_not_show_large_errors(data_folder, share, seed):
+    """Alone, and in the first blocks, they fit a looser odometry than right closures do."""
+    graph, right = with_false(data_folder, 'intel', share, 10, seed, near=40)
+    graph.update(final=True)
+    accepted = np.array([edge.accepted for edge in graph.edges])
+    assert accepted[:right].mean() > 0.9
+    assert accepted[right:].sum() < 5
+    graph, _ = with_false(data_folder, 'intel', share, 10, seed, near=40, alone=True)
+    graph.update(final=True)
+    assert graph.accepted < 0.05 * graph.rejected

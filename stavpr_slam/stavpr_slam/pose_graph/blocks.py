@@ -75,9 +75,11 @@ class Beliefs:
             right = prior * ratio / (prior * ratio + 1 - prior)
             prior = (right.sum(axis=1, keepdims=True) + 1) / (ratio.shape[1] + 2)
         evidence = np.log(prior * ratio + 1 - prior).sum(axis=1)
-        evidence[1:] -= LOOSENED
-        # of a few closures, one that fits by chance would show any factor
-        evidence[1:][right.sum(axis=1)[1:] < SHOWN] = -np.inf
+        count = right.sum(axis=1)
+        # of a few closures, one that fits by chance would show any factor; and many false ones
+        # nearby fit large errors, but without being certain
+        shown = (count >= SHOWN) & (evidence >= CERTAIN * count)
+        evidence[1:] = np.where(shown, evidence - LOOSENED, -np.inf)[1:]
         best = int(np.argmax(evidence))
         self.prior = math.log(prior[best, 0] / (1 - prior[best, 0]))
         return best
@@ -128,6 +130,8 @@ class _Blocks:
             ]
             network.residuals(self._information(network), network.values(placement.initial))
             rows = network.beside_odometry(alone)
+            new = alone >= self._known
+            self._beliefs.innovations[alone[new]] = rows[new]
             self._beliefs.show(rows, FACTORS / self._beliefs.factor)
             self._beliefs.searched = count
 
@@ -182,7 +186,8 @@ class _Blocks:
             rows[new] = network.innovations(taken, np.flatnonzero(new))
             beliefs.innovations[own] = rows
             if self._searches:
-                beliefs.show(beliefs.innovations[self._apart(own)], 1 / FACTORS[FACTORS < 1])
+                compared = np.flatnonzero(np.isfinite(beliefs.innovations[:, -1]))
+                beliefs.show(beliefs.innovations[self._apart(compared)], 1 / FACTORS[FACTORS < 1])
                 information, rows = self._information(network), beliefs.innovations[own]
             passes = new & (squares(rows) <= network.limit)
             passes &= beliefs.odds(rows) > (0 if number else CERTAIN)
