@@ -266,26 +266,11 @@ def _queue(k, starts, rows, head, link, first):
 
 
 @kernel
-def _forward(starts, rows, blocks, first, x):
-    """Solve the lower half in place from a column on, x of shape (count, d) in their order."""
-    count, d = x.shape
-    for j in range(first, count):
-        for a in range(d):
-            for c in range(a):
-                x[j, a] -= blocks[starts[j], a, c] * x[j, c]
-            x[j, a] /= blocks[starts[j], a, a]
-        for p in range(starts[j] + 1, starts[j + 1]):
-            for a in range(d):
-                for c in range(d):
-                    x[rows[p], a] -= blocks[p, a, c] * x[j, c]
-
-
-@kernel
-def _forward_block(starts, rows, blocks, j, x):
-    """Solve a column of the lower half in place for d right sides, x of shape (count, d, d)."""
-    d = x.shape[1]
+def _forward(starts, rows, blocks, j, x):
+    """Solve a column of the lower half in place for n right sides, x of shape (count, d, n)."""
+    d, n = x.shape[1:]
     for a in range(d):
-        for k in range(d):
+        for k in range(n):
             for c in range(a):
                 x[j, a, k] -= blocks[starts[j], a, c] * x[j, c, k]
             x[j, a, k] /= blocks[starts[j], a, a]
@@ -293,7 +278,7 @@ def _forward_block(starts, rows, blocks, j, x):
     for p in range(starts[j] + 1, starts[j + 1]):
         r = rows[p]
         for a in range(d):
-            for k in range(d):
+            for k in range(n):
                 total = 0.0
                 for c in range(d):
                     total += blocks[p, a, c] * own[c, k]
@@ -302,17 +287,17 @@ def _forward_block(starts, rows, blocks, j, x):
 
 @kernel
 def _backward(starts, rows, blocks, x):
-    """Solve the upper half in place."""
-    count, d = x.shape
+    """Solve the upper half in place, x of shape (count, d, 1)."""
+    count, d, _ = x.shape
     for j in range(count - 1, -1, -1):
         for p in range(starts[j] + 1, starts[j + 1]):
             for c in range(d):
                 for a in range(d):
-                    x[j, c] -= blocks[p, a, c] * x[rows[p], a]
+                    x[j, c, 0] -= blocks[p, a, c] * x[rows[p], a, 0]
         for a in range(d - 1, -1, -1):
             for c in range(a + 1, d):
-                x[j, a] -= blocks[starts[j], c, a] * x[j, c]
-            x[j, a] /= blocks[starts[j], a, a]
+                x[j, a, 0] -= blocks[starts[j], c, a] * x[j, c, 0]
+            x[j, a, 0] /= blocks[starts[j], a, a]
 
 
 @kernel
@@ -326,12 +311,13 @@ def _solved(
     determinant = _decompose(starts, rows, blocks)
     if np.isnan(determinant):
         return determinant
-    x, twist = gradient[order], np.zeros(6)
-    _forward(starts, rows, blocks, 0, x)
+    x, twist = np.expand_dims(gradient[order], 2), np.zeros(6)
+    for j in range(len(order)):
+        _forward(starts, rows, blocks, j, x)
     _backward(starts, rows, blocks, x)
     for k in range(len(order)):
         for a in range(d):
-            twist[at[a]] = x[k, a]
+            twist[at[a]] = x[k, a, 0]
         _moved(poses[order[k]], twist, result[order[k]])
     return determinant
 
@@ -359,7 +345,7 @@ def _spread(
             j = min(first, second)
             if j == count:
                 break
-            _forward_block(starts, rows, blocks, j, x)
+            _forward(starts, rows, blocks, j, x)
             _add(result[number], 1.0, x[j].T, x[j], False)
             x[j] = 0.0
             following = rows[starts[j] + 1] if starts[j] + 1 < starts[j + 1] else count
