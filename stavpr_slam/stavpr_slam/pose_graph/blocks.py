@@ -9,7 +9,7 @@ and the part of all closures that are right: certain ones first, then those that
 The errors that the file states are right up to a factor, which the closures show.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -19,7 +19,7 @@ from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.runs import LONGEST
 from stavpr_slam.pose_graph.sessions import extended, few, Pair, place, Placement
-from stavpr_slam.pose_graph.solution import NOTHING, Solution
+from stavpr_slam.pose_graph.solution import Solution
 from stavpr_slam.pose_graph.solver import likelihoods, scaled, squares
 
 BLOCKS = 20  # of a graph that comes at once
@@ -29,7 +29,6 @@ WEAKEST = 12  # closures that are left out on trial
 PLAUSIBLE = 50  # rejected closures that are tried in their place
 FACTORS = 2.0 ** np.arange(-13, 5, 0.5)  # on the errors that a file states
 STEPS = 20  # of expectation and maximization
-NEARLY_ALL = 0.9  # of the closures, that agree together
 SHOWN = 4  # right closures that show a factor, at least
 Found = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
 
@@ -85,6 +84,13 @@ class Beliefs:
         return best
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredSolution(Solution):
+    """The nodes of a graph of another program, and what is known of its closures."""
+
+    beliefs: Beliefs
+
+
 def unknown(count: int, width: int) -> np.ndarray:
     """Return innovations of closures that were not compared yet: none is probable."""
     result = np.zeros((count, width))
@@ -120,7 +126,9 @@ class _Blocks:
         self._taken[: self._known] = last.accepted & placement.allowed[: self._known]
         network = Network(chain, placement.initial, closures, placement.links)
         space = room(placement.initial, network.freedom)
-        before = last.beliefs or Beliefs(space, unknown(0, 2 * network.freedom + 1))
+        before = Beliefs(space, unknown(0, 2 * network.freedom + 1))
+        if isinstance(last, MeasuredSolution):
+            before = last.beliefs
         self._beliefs = before.grown(space, count)
         self._searches = count > 0 and count >= GROWN * before.searched
         if self._searches:
@@ -156,10 +164,9 @@ class _Blocks:
                 self._decide(part, np.flatnonzero(came), ~seen[came], is_whole and end == count)
             seen |= came
         scales = np.full(len(self._chain.robots), self._beliefs.factor)
-        return replace(
-            NOTHING, nodes=self._nodes, accepted=self._taken, counted=self._taken, scales=scales,
-            placement=self._placement, beliefs=self._beliefs,
-        )  # fmt: skip
+        return MeasuredSolution(
+            self._nodes, self._taken, self._taken, scales, self._placement, self._beliefs
+        )
 
     def _decide(self, part: KeyframeChain, own: np.ndarray, new: np.ndarray, swaps: bool) -> None:
         """
@@ -167,7 +174,7 @@ class _Blocks:
 
         :param own: numbers of all closures up to its end.
         :param new: those of them that are new, bool.
-        :param swaps: leave out weak ones on trial; without any, take those that agree together.
+        :param swaps: leave out weak ones on trial.
         """
         beliefs = self._beliefs
         network = Network(part, self._nodes, self._closures[own], self._placement.links)
@@ -202,8 +209,6 @@ class _Blocks:
             taken = agree
         if swaps and taken.any():
             taken, values = self._swapped(network, information, values, taken, own)
-        elif swaps:
-            taken, values = self._together(network, information, values, own)
         self._taken[own], self._nodes = taken, network.nodes(values)
 
     def _consistent(
@@ -244,18 +249,6 @@ class _Blocks:
             agree = agree & (np.arange(len(agree)) != chosen[np.argmin(odds)])
             values, _, _ = network.solve(information, values, agree * 1.0)
         return agree, values
-
-    def _together(
-        self, network: Network, information: np.ndarray, values: np.ndarray, own: np.ndarray
-    ) -> Found:
-        """Take the closures that agree, nearly all, where each alone proves nothing."""
-        taken = np.zeros(len(own), bool)
-        fits = squares(self._beliefs.innovations[own]) <= network.limit
-        agree, moved = self._consistent(network, information, values, fits)
-        _, evidence = network.fit(information, taken, values, self._beliefs.space)
-        moved, found = network.fit(information, agree, moved, self._beliefs.space)
-        is_shown = agree.sum() >= max(SHOWN, NEARLY_ALL * len(agree)) and found > evidence
-        return (agree, moved) if is_shown else (taken, values)
 
     def _swapped(
         self, network: Network, information: np.ndarray, values: np.ndarray, taken: np.ndarray,

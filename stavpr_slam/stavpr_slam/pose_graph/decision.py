@@ -175,7 +175,7 @@ class Decider:
         :param scales: factors on its errors, of each robot.
         """
         network = self._network
-        information = network.odometry(scales[self._chain.robot])
+        information = self.information(scales)
         none, start = np.zeros(len(network.query), bool), self._start
         try:
             taken, values = network.robust(information, start)

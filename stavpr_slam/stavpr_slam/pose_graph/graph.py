@@ -18,7 +18,7 @@ from stavpr_slam.pose_graph.decision import events, GROWN, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extended
-from stavpr_slam.pose_graph.solution import decided, followed, NOTHING, Solution
+from stavpr_slam.pose_graph.solution import decided, DriveSolution, followed, NOTHING, Solution
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
@@ -89,8 +89,10 @@ class PoseGraph:
     @property
     def refused(self) -> float:
         """Return the evidence against a correction that is not published; 0 = there is none."""
-        decision = self._solution.decision
-        return 0.0 if decision.is_published else -decision.evidence
+        last = self._solution
+        if not isinstance(last, DriveSolution) or last.decision.is_published:
+            return 0.0
+        return -last.decision.evidence
 
     def add_odometry(
         self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
@@ -198,11 +200,12 @@ class PoseGraph:
         last, given = self._solution, (self.chain, self._closures)
         if self.settings.measured:
             return added(*given, NOTHING if final else last)
-        if not final and len(self._known) <= GROWN * self._searched:
+        is_searched = not final and len(self._known) <= GROWN * self._searched
+        if isinstance(last, DriveSolution) and is_searched:
             return followed(*given, last) or decided(*given, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
-        found = without = self._decided()
+        found = without = decided(*given)
         for _ in range(MAX_BREAKS):
             better = self._with_break(found)
             if better is None:
@@ -215,9 +218,6 @@ class PoseGraph:
             found = without
         self._searched = len(self._known)
         return found
-
-    def _decided(self) -> Solution:
-        return decided(self.chain, self._closures)
 
     def _split(self, node: int, begins: bool) -> None:
         """Begin a session at a node, or end it; closures between it and the one before change."""
@@ -233,7 +233,7 @@ class PoseGraph:
             if resolved is not None:
                 self._closures[number] = resolved
 
-    def _with_break(self, before: Solution) -> Solution | None:
+    def _with_break(self, before: DriveSolution) -> DriveSolution | None:
         """Begin a session where closures prove that the robot was carried; None = nowhere."""
         nodes = dict.fromkeys(
             node
@@ -246,7 +246,7 @@ class PoseGraph:
         )
         for node in [*nodes][:MAX_BREAKS]:
             self._split(node, True)
-            after = self._decided()
+            after = decided(self.chain, self._closures)
             if (
                 self._more(before, after) >= breaks.GAIN
                 or after.decision.gain - before.decision.gain > breaks.EVIDENCE

@@ -3,7 +3,6 @@
 """Solutions of a pose graph: a decision on all closures, or new ones added to the last."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from stavpr_slam.pose_graph.closures import ClosureArrays
@@ -29,9 +28,6 @@ class Solution:
     :param nodes: transforms in the map, (N, 4, 4).
     :param accepted, counted: of n closures, which are right, and which count in the solution.
     :param scales: factors on the errors of the odometry of each robot.
-    :param tried: robust solutions: nodes, closures that agree, and the strained node; where the
-        errors of the odometry were searched.
-    :param beliefs: of a graph of another program, see :mod:`stavpr_slam.pose_graph.blocks`.
     """
 
     nodes: np.ndarray
@@ -39,9 +35,6 @@ class Solution:
     counted: np.ndarray
     scales: np.ndarray
     placement: Placement
-    decision: Decision
-    tried: list[tuple[np.ndarray, np.ndarray, int]]
-    beliefs: Any = None
 
     @property
     def rejected(self) -> int:
@@ -49,9 +42,22 @@ class Solution:
         return int((~self.accepted).sum())
 
 
+@dataclass(frozen=True, eq=False)
+class DriveSolution(Solution):
+    """
+    The nodes of drives.
+
+    :param tried: robust solutions: nodes, closures that agree, and the strained node; where the
+        errors of the odometry were searched.
+    """
+
+    decision: Decision
+    tried: list[tuple[np.ndarray, np.ndarray, int]]
+
+
 def decided(
     chain: KeyframeChain, closures: ClosureArrays, scales: np.ndarray | None = None
-) -> Solution:
+) -> DriveSolution:
     """
     Decide on all closures anew, and estimate all nodes.
 
@@ -82,13 +88,15 @@ def decided(
         result[placement.allowed] = chosen
         return result
 
-    return Solution(
+    return DriveSolution(
         network.nodes(values), among_all(accepted), among_all(counted), found, placement, decision,
         [(network.nodes(each.values), among_all(each.agreeing), each.strained) for each in tried],
     )  # fmt: skip
 
 
-def followed(chain: KeyframeChain, closures: ClosureArrays, last: Solution) -> Solution | None:
+def followed(
+    chain: KeyframeChain, closures: ClosureArrays, last: DriveSolution
+) -> DriveSolution | None:
     """
     Add new closures to the last solution, each of which agrees with it or contradicts it.
 
@@ -133,6 +141,5 @@ def followed(chain: KeyframeChain, closures: ClosureArrays, last: Solution) -> S
 NOTHING = Solution(
     np.zeros((0, 4, 4)), np.zeros(0, bool), np.zeros(0, bool), np.zeros(0),
     Placement(np.zeros((0, 4, 4)), {}, frozenset(), np.zeros(0, bool)),
-    Decision(np.zeros(0), np.zeros(0, bool), np.zeros((0, 4, 4)), 0.0), [],
 )  # fmt: skip
 """Of a graph without odometry."""
