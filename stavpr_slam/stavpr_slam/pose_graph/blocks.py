@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 from stavpr_slam.pose_graph.closures import ClosureArrays
-from stavpr_slam.pose_graph.decision import CERTAIN, GROWN, LOOSENED, room
+from stavpr_slam.pose_graph.decision import CERTAIN, GROWN, LOOSENED
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.runs import LONGEST
@@ -37,7 +37,7 @@ class Beliefs:
     """
     What is known of n closures, and of the errors that the file states.
 
-    :param space: logarithm of the poses of the map, see :func:`room`.
+    :param space: logarithm of the poses of the map, see :attr:`Network.room`.
     :param innovations: of each closure when it was compared with a solution at last, see
         :meth:`Solver.innovations`, in errors with the factor of the odometry.
     """
@@ -125,11 +125,10 @@ class _Blocks:
         self._taken = np.zeros(count, bool)
         self._taken[: self._known] = last.accepted & placement.allowed[: self._known]
         network = Network(chain, placement.initial, closures, placement.links)
-        space = room(placement.initial, network.freedom)
-        before = Beliefs(space, unknown(0, 2 * network.freedom + 1))
+        before = Beliefs(network.room, unknown(0, 2 * network.freedom + 1))
         if isinstance(last, MeasuredSolution):
             before = last.beliefs
-        self._beliefs = before.grown(space, count)
+        self._beliefs = before.grown(network.room, count)
         self._searches = count > 0 and count >= GROWN * before.searched
         if self._searches:
             alone = self._apart(np.arange(count))
@@ -178,7 +177,7 @@ class _Blocks:
         """
         beliefs = self._beliefs
         network = Network(part, self._nodes, self._closures[own], self._placement.links)
-        network.limit *= NEAR
+        network.limit, network.room = network.limit * NEAR, beliefs.space
         values, taken = network.values(self._nodes), self._taken[own]
         information = self._information(network)
         away = network.residuals(information, values)
@@ -215,14 +214,8 @@ class _Blocks:
         self, network: Network, information: np.ndarray, values: np.ndarray, among: np.ndarray
     ) -> Found:
         """Solve for closures, without those that contradict others."""
-        limit = network.limit
         moved, _, _ = network.solve(information, values, among * 1.0)
-        away = network.residuals(information, moved)
-        agree = among & (away <= limit)
-        if (away[among] > limit).any():
-            most = float(network.residuals(information, values)[among].max())
-            start = limit / max(2 * most, limit)
-            agree, moved = network.robust(information, values, start, among, limit)
+        agree = among & (network.residuals(information, moved) <= network.limit)
         if (agree != among).any():
             moved, _, _ = network.solve(information, moved, agree * 1.0)
         return agree, moved
@@ -256,7 +249,7 @@ class _Blocks:
     ) -> Found:  # fmt: skip
         """Leave out a weak closure and those beside it, for others, where that is evidence."""
         beliefs, numbers = self._beliefs, np.arange(len(taken))
-        _, evidence = network.fit(information, taken, values, beliefs.space)
+        _, evidence = network.fit(information, taken, values)
         odds = beliefs.odds(beliefs.innovations[own])
         for weak in np.argsort(np.where(taken, odds, np.inf))[:WEAKEST]:
             away = np.abs([each - each[weak] for each in (network.query, network.place)])
@@ -272,7 +265,7 @@ class _Blocks:
             fits = (squares(rows) <= network.limit) & (beliefs.odds(rows) > 0)
             trial |= np.isin(numbers, new[fits])
             trial, moved = self._consistent(network, information, moved, trial)
-            moved, found = network.fit(information, trial, moved, beliefs.space)
+            moved, found = network.fit(information, trial, moved)
             if found > evidence:
                 taken, values, evidence = trial, moved, found
         return taken, values

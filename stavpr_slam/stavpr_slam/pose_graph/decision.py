@@ -52,18 +52,6 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
     return numbers
 
 
-def room(nodes: np.ndarray, freedom: int) -> float:
-    """
-    Return the logarithm of the poses of a map, by a normal density's constant.
-
-    :param nodes: transforms, (N, 4, 4).
-    :param freedom: of poses, 3 or 6.
-    """
-    size = np.maximum(np.sort(np.ptp(nodes[:, :3, 3], axis=0)), 1.0)
-    space = size[1:].prod() * 2 * math.pi if freedom == 3 else size.prod() * 8 * math.pi**2
-    return math.log(space) - freedom / 2 * math.log(2 * math.pi)
-
-
 @dataclass(frozen=True, eq=False)
 class Decision:
     """
@@ -114,7 +102,6 @@ class Decider:
         self._chain, self._network = chain, network
         self._start = network.values(initial)
         self._events = events(chain, network.query, network.place)
-        self._room = room(initial, network.freedom)
 
     def information(self, scales: np.ndarray) -> np.ndarray:
         """Return the information of all factors at factors on the errors of each robot."""
@@ -140,21 +127,11 @@ class Decider:
         counted[own[~np.isin(self._events[own], self._events[counted])]] = True
         return counted
 
-    def fit(
-        self, information: np.ndarray, counted: np.ndarray, values: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """
-        Estimate the variables by least squares, and return them and the evidence.
-
-        :param counted: closures that count, shape (n,), bool.
-        """
-        return self._network.fit(information, counted, values, self._room)
-
     def _evidence(self, information: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
         """Return the evidence of closures, of which one of each event counts."""
         counted = np.zeros_like(taken)
         counted[self.representatives(taken)] = True
-        return self.fit(information, counted, values)[1]
+        return self._network.fit(information, counted, values)[1]
 
     def _chance(self, taken: np.ndarray) -> float:
         """
@@ -234,7 +211,7 @@ class Decider:
         def fitted(factor: float) -> tuple[float, float, np.ndarray]:
             information = self.information(factor * decision.scales)
             try:
-                values, evidence = self.fit(information, counted, decision.values)
+                values, evidence = self._network.fit(information, counted, decision.values)
             except np.linalg.LinAlgError:
                 return -math.inf, factor, decision.values
             return evidence, factor, values

@@ -8,6 +8,7 @@ nodes inside a run follow from its ends. Drives in a plane have poses in the pla
 """
 
 from collections.abc import Mapping
+import math
 
 import numpy as np
 from scipy.stats import chi2
@@ -15,6 +16,7 @@ from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.runs import Runs
+from stavpr_slam.pose_graph.sessions import session_pairs
 from stavpr_slam.pose_graph.solver import Solver
 
 ANCHOR = 1e-4  # deviation of the pose of the first node, rad and m
@@ -26,6 +28,18 @@ GROWTH = 2.0  # of the parameter of graduated non-convexity
 FIRST_STEPS, MAX_STEPS = 4, 25  # of Gauss and Newton: with all closures, and at most
 NONE = 1e-4  # weight of a closure that does not count
 CONVERGED = 1e-3  # change of the error, half the squared deviations, of a solution
+
+
+def room(nodes: np.ndarray, freedom: int) -> float:
+    """
+    Return the logarithm of the poses of a map, by a normal density's constant.
+
+    :param nodes: transforms, (N, 4, 4).
+    :param freedom: of poses, 3 or 6.
+    """
+    size = np.maximum(np.sort(np.ptp(nodes[:, :3, 3], axis=0)), 1.0)
+    space = size[1:].prod() * 2 * math.pi if freedom == 3 else size.prod() * 8 * math.pi**2
+    return math.log(space) - freedom / 2 * math.log(2 * math.pi)
 
 
 class Network:
@@ -49,6 +63,7 @@ class Network:
     ) -> None:
         self._chain, self._links = chain, links
         self.query, self.place = closures.query, closures.place
+        self._pairs = session_pairs(chain, closures)
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
@@ -57,7 +72,8 @@ class Network:
         at = np.array(PLANAR if self._is_planar else range(6))
         self.freedom = len(at)
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
-        self.loose_determinant = float(np.log(loose).sum() / 2)
+        self.room = room(initial, self.freedom)
+        self._loose_determinant = float(np.log(loose).sum() / 2)
         self.limit = float(chi2.ppf(INLIER, self.freedom))
         self.information = np.linalg.inv(closures.covariance[:, at[:, None], at])
 
@@ -85,11 +101,10 @@ class Network:
 
     def joined(self, numbers: np.ndarray) -> int:
         """Return how many sessions some of the closures join to others."""
-        session = self._chain.session
-        ends = session[self.query[numbers]], session[self.place[numbers]]
-        across = ends[0] != ends[1]
+        session, pairs = self._chain.session, self._pairs[numbers]
+        across = pairs[pairs[:, 0] != pairs[:, 1]]
         anchored = {int(session[node]) for node, link in self._links.items() if link < 0}
-        return len({*ends[0][across].tolist(), *ends[1][across].tolist()} - anchored - {-1})
+        return len({*across.ravel().tolist()} - anchored - {-1})
 
     def values(self, nodes: np.ndarray) -> np.ndarray:
         """Return the variables of transforms of all nodes (N, 4, 4)."""
@@ -141,9 +156,8 @@ class Network:
 
     def joining(self, taken: np.ndarray) -> np.ndarray:
         """Return which closures join sessions that those that are taken do not join, (n,)."""
-        pairs = np.sort(self._chain.session[np.stack([self.query, self.place])], axis=0)
-        key = pairs[0] * len(self._chain) + pairs[1]
-        return (pairs[0] != pairs[1]) & ~np.isin(key, key[taken])
+        pairs, key = self._pairs, self._pairs @ [len(self._chain), 1]
+        return (pairs[:, 0] != pairs[:, 1]) & ~np.isin(key, key[taken])
 
     def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""
@@ -157,12 +171,7 @@ class Network:
         return self._solver.step(values, whole)
 
     def robust(
-        self,
-        odometry: np.ndarray,
-        values: np.ndarray,
-        start: float = 0.0,
-        among: np.ndarray | bool = True,
-        limit: float = 0.0,
+        self, odometry: np.ndarray, values: np.ndarray, start: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """
         Decide which closures are right by graduated non-convexity, truncated least squares.
@@ -171,24 +180,21 @@ class Network:
         a step of Gauss and Newton for each parameter; the odometry is right.
 
         :param start: first parameter, where the variables are a solution already.
-        :param among: closures that may be right, shape (n,), bool.
-        :param limit: of squared deviations, another than :attr:`limit`.
         :returns: whether each closure is, shape (n,), and the variables.
         :raises LinAlgError: no solution.
         """
-        weights, limit = np.ones(len(self.query)) * among, limit or self.limit
+        weights, limit = np.ones(len(self.query)), self.limit
         squared = self.residuals(odometry, values)
         for _ in range(0 if start else FIRST_STEPS):
             values, _ = self._step(values, weights)
             squared = self.residuals(odometry, values)
-        if 2 * (squared * among).max(initial=0.0) <= limit:
+        if 2 * squared.max(initial=0.0) <= limit:
             return weights > 0, values
-        mu = start or limit / (2 * (squared * among).max() - limit)
+        mu = start or limit / (2 * squared.max() - limit)
         for _ in range(MAX_STEPS):
             surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
             between = np.sqrt(limit * mu * (mu + 1) / squared.clip(surely)) - mu
             weights = np.where(squared >= never, 0.0, np.where(squared <= surely, 1.0, between))
-            weights *= among
             values, _ = self._step(values, weights)
             if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
                 break
@@ -216,18 +222,17 @@ class Network:
         return values, error, determinant
 
     def fit(
-        self, odometry: np.ndarray, counted: np.ndarray, values: np.ndarray, room: float
+        self, odometry: np.ndarray, counted: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, float]:
         """
         Estimate the variables by least squares, and return them and the evidence.
 
         :param counted: closures that count, shape (n,), bool.
-        :param room: logarithm of the poses of the map.
         """
         own = np.flatnonzero(counted)
         values, squared, determinant = self.solve(odometry, values, counted * 1.0)
         whole = np.concatenate([np.ones(len(values), bool), counted])
         known = float(np.linalg.slogdet(odometry[whole])[1].sum()) / 2
-        evidence = known - determinant - squared / 2 + len(own) * room
+        evidence = known - determinant - squared / 2 + len(own) * self.room
         # a session may begin anywhere in the same space
-        return values, evidence - self.joined(own) * (room + self.loose_determinant)
+        return values, evidence - self.joined(own) * (self.room + self._loose_determinant)

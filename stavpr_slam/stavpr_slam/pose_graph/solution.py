@@ -130,7 +130,7 @@ def followed(
         if (squares(network.innovations(before, far)) > network.limit)[agree[far]].any():
             return None
     own = decider.counted(agree, used.is_independent)
-    values, _ = decider.fit(information, own, values)
+    values, _ = network.fit(information, own, values)
     if (network.residuals(information, values)[far][agree[far]] > network.limit).any():
         return None
     accepted, counted = np.zeros((2, len(closures)), bool)
