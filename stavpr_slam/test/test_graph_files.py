@@ -10,7 +10,7 @@ from stavpr_ros.commands.stavpr import main
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import blocks
+from stavpr_slam.pose_graph import blocks, tuning
 from stavpr_slam.pose_graph.blocks import _Blocks as Blocks
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges, reversed_edge
 from test_pose_graph import error
@@ -82,7 +82,7 @@ def test_closures_of_a_g2o_file_correct_its_odometry(tmp_path, freedom, false):
 def test_errors_that_a_file_states_wrong_are_recognized(tmp_path, monkeypatch, stated, searched):
     """At deviations of 3 m and a radian, false closures agree with a path that they bend."""
     if not searched:
-        monkeypatch.setattr(blocks, 'FACTORS', np.ones(1))
+        monkeypatch.setattr(tuning, 'FACTORS', np.ones(1))
     graph = graph_of(read_edges(write(tmp_path / 'a.g2o', 3, 0.5, stated)))
     found = to_poses(graph.update(final=True))
     right = error(found, to_poses(truth(3))) < 0.2 and graph.accepted == 21
@@ -276,16 +276,16 @@ def kept(blocks, network, information, values, agree, own):
 
 
 CASES = {  # of a rule: a graph that is wrong without it, and what replaces the rule
-    'certain closures first': ('MIT', 0.1, 10, 0, 0, blocks, 'CERTAIN', 0.0),
-    'rejected ones that may agree by now': ('MIT', 0.3, 1, 2, 0, blocks, 'PASSES', 1),
+    'certain closures first': ('MIT', 0.1, 10, 0, 0, tuning, 'CERTAIN', 0.0),
+    'rejected ones that may agree by now': ('MIT', 0.3, 1, 2, 0, blocks, 'PASSES', (False,)),
     'those less probable than a place anywhere': ('MIT', 0.5, 1, 0, 0, Blocks, '_certain', kept),
     'weak ones that leave for others': ('MIT', 0.3, 1, 0, 0, Blocks, '_swapped', kept),
     'one of ten nodes shows the factor': (
         'MIT', 0.5, 10, 1, 40, Blocks, '_apart', lambda blocks, numbers: numbers,
     ),
-    'blocks by time': ('MIT', 0.3, 1, 2, 0, blocks, 'BLOCKS', 1),
-    'four times the limit': ('parking-garage', 0.1, 1, 0, 0, blocks, 'NEAR', 1.0),
-    'the factor on all errors': ('intel', 0.5, 10, 0, 0, blocks, 'FACTORS', np.ones(1)),
+    'blocks by time': ('MIT', 0.3, 1, 2, 0, tuning, 'BLOCKS', 1),
+    'four times the limit': ('parking-garage', 0.1, 1, 0, 0, tuning, 'TAILS', 1.0),
+    'the factor on all errors': ('intel', 0.5, 10, 0, 0, tuning, 'FACTORS', np.ones(1)),
 }  # fmt: skip
 
 

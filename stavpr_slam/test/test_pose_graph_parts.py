@@ -14,7 +14,7 @@ from stavpr_slam.pose_graph import (
     OdometryNoise,
     optimize,
     PoseGraph,
-    runs,
+    tuning,
 )
 from stavpr_slam.pose_graph.closures import BETWEEN_NODES
 from stavpr_slam.pose_graph.files import save_graph
@@ -66,7 +66,7 @@ def test_optimize_with_runs_agrees_with_all_keyframes(monkeypatch):
     closures = [closure(truth, q, q - LAP) for q in range(LAP, 2 * LAP)]
     stamps = (np.arange(len(truth)) + 1) * SECOND
     found, _ = optimize(stamps, odometry_of(truth), closures)
-    monkeypatch.setattr(runs, 'LONGEST', 1)
+    monkeypatch.setattr(tuning, 'LONGEST', 1)
     every, _ = optimize(stamps, odometry_of(truth), closures)
     assert np.linalg.norm(found[:, :3] - every[:, :3], axis=1).max() < 0.02
 

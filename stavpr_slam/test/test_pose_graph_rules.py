@@ -8,16 +8,7 @@ from motions import exponentials
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import (
-    breaks,
-    Closure,
-    decision,
-    keyframes,
-    network,
-    optimize,
-    PoseGraph,
-    sessions,
-)
+from stavpr_slam.pose_graph import Closure, keyframes, network, optimize, PoseGraph, tuning
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
 
@@ -89,7 +80,7 @@ def test_false_closures_and_the_right_half_that_comes_later():
 
 def test_false_shift_without_evidence(monkeypatch):
     drive = false_drive('shift')
-    monkeypatch.setattr(decision, 'CERTAIN', -1e9)
+    monkeypatch.setattr(tuning, 'CERTAIN', -1e9)
     assert ratio(*drive)[0] > 2
 
 
@@ -110,8 +101,8 @@ def test_large_drift_with_a_tight_odometry_only(monkeypatch):
     drive = truth, slight(truth, 2.0), closures
     found, graph = ratio(*drive)
     assert found < 0.15
-    assert graph.scale > decision.TIGHT
-    monkeypatch.setattr(decision, 'SCALES', decision.SCALES[:1])
+    assert graph.scale > tuning.TIGHT
+    monkeypatch.setattr(tuning, 'SCALES', tuning.SCALES[:1])
     assert ratio(*drive)[0] > 0.3
 
 
@@ -186,7 +177,7 @@ def test_few_wrong_closures_join_no_session(monkeypatch):
     made = [closure(truth, q, q, q - 50, stamps) for q in range(70, 76)]
     found, _ = optimize(stamps, odometry_of(truth), made)
     assert error(found, truth) < 2
-    monkeypatch.setattr(sessions, 'JOINS', 1)
+    monkeypatch.setattr(tuning, 'JOINS', 1)
     found, _ = optimize(stamps, odometry_of(truth), made)
     assert error(found, truth) > 20
 
@@ -223,7 +214,7 @@ def test_few_false_runs_prove_no_break():
 
 def test_carried_robot_without_breaks(monkeypatch):
     """With breaks, see test_optimize_carried_robot_cuts_where_the_odometry_stands."""
-    monkeypatch.setattr(breaks, 'SUPPORT', 10**6)
+    monkeypatch.setattr(tuning, 'SUPPORT', 10**6)
     found, graph = ratio(*carried_drive())
     assert (found > 0.3, graph.splits) == (True, 0)
 
@@ -241,7 +232,7 @@ def test_break_is_at_a_pause(monkeypatch):
     ]
     found, _ = optimize(stamps, odometry, closures)
     assert error(found, truth) < 1
-    monkeypatch.setattr(breaks, 'PAUSE', np.inf)
+    monkeypatch.setattr(tuning, 'PAUSE', np.inf)
     found, _ = optimize(stamps, odometry, closures)
     assert error(found, truth) > 3
 

@@ -13,23 +13,15 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
-from stavpr_slam.pose_graph.decision import CERTAIN, GROWN, LOOSENED
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
-from stavpr_slam.pose_graph.runs import LONGEST
 from stavpr_slam.pose_graph.sessions import extended, few, Pair, place, Placement
 from stavpr_slam.pose_graph.solution import Solution
 from stavpr_slam.pose_graph.solver import likelihoods, scaled, squares
 
-BLOCKS = 20  # of a graph that comes at once
-PASSES = 2  # over the closures of a block: new ones, then rejected ones that may agree by now
-NEAR = 4.0  # times the limit of a chi-square: errors have long tails
-WEAKEST = 12  # closures that are left out on trial
-PLAUSIBLE = 50  # rejected closures that are tried in their place
-FACTORS = 2.0 ** np.arange(-13, 5, 0.5)  # on the errors that a file states
-STEPS = 20  # of expectation and maximization
-SHOWN = 4  # right closures that show a factor, at least
+PASSES = False, True  # over the closures of a block: again for rejected ones that agree by now
 Found = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
 
 
@@ -70,15 +62,13 @@ class Beliefs:
     def _best(self, densities: np.ndarray) -> int:
         """Return the best of k alternatives, the first of which needs no evidence, (k, n)."""
         ratio, prior = np.exp((densities + self.space).clip(-50, 50)), np.array([[0.5]])
-        for _ in range(STEPS):  # the part of the closures that are right
+        for _ in range(tuning.MAX_STEPS):  # the part of the closures that are right
             right = prior * ratio / (prior * ratio + 1 - prior)
             prior = (right.sum(axis=1, keepdims=True) + 1) / (ratio.shape[1] + 2)
         evidence = np.log(prior * ratio + 1 - prior).sum(axis=1)
-        count = right.sum(axis=1)
-        # of a few closures, one that fits by chance would show any factor; and many false ones
-        # nearby fit large errors, but without being certain
-        shown = (count >= SHOWN) & (evidence >= CERTAIN * count)
-        evidence[1:] = np.where(shown, evidence - LOOSENED, -np.inf)[1:]
+        # many false ones nearby fit large errors, but without being certain
+        is_certain = evidence >= tuning.CERTAIN * right.sum(axis=1)
+        evidence[1:] = np.where(is_certain, evidence - tuning.LOOSER, -np.inf)[1:]
         best = int(np.argmax(evidence))
         self.prior = math.log(prior[best, 0] / (1 - prior[best, 0]))
         return best
@@ -129,7 +119,7 @@ class _Blocks:
         if isinstance(last, MeasuredSolution):
             before = last.beliefs
         self._beliefs = before.grown(network.room, count)
-        self._searches = count > 0 and count >= GROWN * before.searched
+        self._searches = count > 0 and count >= tuning.SEARCH * before.searched
         if self._searches:
             alone = self._apart(np.arange(count))
             alone = alone[
@@ -139,7 +129,7 @@ class _Blocks:
             rows = network.beside_odometry(alone)
             new = alone >= self._known
             self._beliefs.innovations[alone[new]] = rows[new]
-            self._beliefs.show(rows, FACTORS / self._beliefs.factor)
+            self._beliefs.show(rows, tuning.FACTORS / self._beliefs.factor)
             self._beliefs.searched = count
 
     def _information(self, network: Network) -> np.ndarray:
@@ -148,13 +138,13 @@ class _Blocks:
 
     def _apart(self, numbers: np.ndarray) -> np.ndarray:
         """Return closures of which neighboring nodes have one: groups may be wrong together."""
-        found = np.unique(self._latest[numbers] // LONGEST, return_index=True)[1]
+        found = np.unique(self._latest[numbers] // tuning.LONGEST, return_index=True)[1]
         return np.asarray(numbers[found])
 
     def solution(self) -> Solution:
         """Return the solution with all closures."""
         count, seen = len(self._chain), np.arange(len(self._taken)) < self._known
-        step, is_whole = max(1, count // BLOCKS), not self._known
+        step, is_whole = max(1, count // tuning.BLOCKS), not self._known
         for end in (*range(len(self._nodes) + step, count, step), count):
             part = self._chain.until(end)
             self._nodes = extended(part, self._nodes, self._placement)
@@ -177,13 +167,13 @@ class _Blocks:
         """
         beliefs = self._beliefs
         network = Network(part, self._nodes, self._closures[own], self._placement.links)
-        network.limit, network.room = network.limit * NEAR, beliefs.space
+        network.limit, network.room = network.limit * tuning.TAILS, beliefs.space
         values, taken = network.values(self._nodes), self._taken[own]
         information = self._information(network)
         away = network.residuals(information, values)
-        for number in range(PASSES):
+        for again in PASSES:
             rows = beliefs.innovations[own]
-            if number:
+            if again:
                 near = away < network.limit
                 fits = squares(rows) <= network.limit
                 new = ~taken & (near | (fits & (beliefs.odds(rows) > 0)))
@@ -192,11 +182,12 @@ class _Blocks:
             rows[new] = network.innovations(taken, np.flatnonzero(new))
             beliefs.innovations[own] = rows
             if self._searches:
-                compared = np.flatnonzero(np.isfinite(beliefs.innovations[:, -1]))
-                beliefs.show(beliefs.innovations[self._apart(compared)], 1 / FACTORS[FACTORS < 1])
+                compared = self._apart(np.flatnonzero(np.isfinite(beliefs.innovations[:, -1])))
+                factors = tuning.FACTORS[tuning.FACTORS < 1]
+                beliefs.show(beliefs.innovations[compared], 1 / factors)
                 information, rows = self._information(network), beliefs.innovations[own]
             passes = new & (squares(rows) <= network.limit)
-            passes &= beliefs.odds(rows) > (0 if number else CERTAIN)
+            passes &= beliefs.odds(rows) > (0 if again else tuning.CERTAIN)
             passes |= new & network.joining(taken)
             if not passes.any():
                 continue
@@ -233,7 +224,7 @@ class _Blocks:
         while agree.any():
             chosen = np.flatnonzero(agree)
             odds = beliefs.odds(beliefs.innovations[own[chosen]])
-            chosen = chosen[np.argsort(odds)[:WEAKEST]]
+            chosen = chosen[np.argsort(odds)[: tuning.WEAKEST]]
             network.residuals(information, values)
             rows = beliefs.innovations[own[chosen]] = network.innovations(agree, chosen)
             odds = beliefs.odds(rows)
@@ -251,12 +242,12 @@ class _Blocks:
         beliefs, numbers = self._beliefs, np.arange(len(taken))
         _, evidence = network.fit(information, taken, values)
         odds = beliefs.odds(beliefs.innovations[own])
-        for weak in np.argsort(np.where(taken, odds, np.inf))[:WEAKEST]:
+        for weak in np.argsort(np.where(taken, odds, np.inf))[: tuning.WEAKEST]:
             away = np.abs([each - each[weak] for each in (network.query, network.place)])
-            others = away.max(axis=0) >= LONGEST
+            others = away.max(axis=0) >= tuning.LONGEST
             trial = taken & others
             new = numbers[others & ~taken]
-            new = new[np.argsort(-odds[new])[:PLAUSIBLE]]
+            new = new[np.argsort(-odds[new])[: tuning.PLAUSIBLE]]
             if not taken[weak] or not len(new):
                 continue
             moved, _, _ = network.solve(information, values, trial * 1.0)

@@ -16,20 +16,10 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 
-# Chosen on KITTI 00 and 08 and a world of the demonstration; docs/slam.md has half and double.
-TIGHT = 0.125  # factor on the errors of the odometry that it is trusted by at first
-SCALES = TIGHT * 2.0 ** np.arange(6)  # those that evidence can loosen it to: up to 4
-PRECISE = TIGHT / 16  # the smallest one of a solution
-CERTAIN = math.log(20)  # evidence from which a correction is published
-LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
-DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
-AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
-GROWN = 1.1  # times the closures of the last search: it is made anew
-STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
-GAP = 15.0  # meters that queries and places of an event are apart at most
 FAR = 1e9  # meters between two sessions
 
 
@@ -43,7 +33,7 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
         [chain.travelled[each] + FAR * chain.session[each] for each in (query, place)], 1
     )
     near = (
-        KDTree(at).query_pairs(GAP, np.inf, output_type='ndarray')
+        KDTree(at).query_pairs(tuning.GAP, np.inf, output_type='ndarray')
         if len(at)
         else np.zeros((0, 2), int)
     )
@@ -91,8 +81,8 @@ class Decision:
         Of many events, a few agree at random where the odometry explains everything: their chance
         counts against them, and so does each doubling of the errors in the settings.
         """
-        doublings = float(np.log2(self.scales.clip(1.0)).sum())
-        return max(0.0, self.evidence - self.chance - DOUBLED * doublings) * self.is_published
+        price = tuning.LOOSER * float(np.log2(self.scales.clip(1.0)).sum())
+        return max(0.0, self.evidence - self.chance - price) * self.is_published
 
 
 class Decider:
@@ -158,7 +148,7 @@ class Decider:
             taken, values = network.robust(information, start)
             evidence = self._evidence(information, taken, values)
             if taken.any():  # closures beside them may agree by now
-                more, moved = network.robust(information, values, AGAIN)
+                more, moved = network.robust(information, values, tuning.AGAIN)
                 found = self._evidence(information, more, moved)
                 if found > evidence and more.sum() > taken.sum():
                     taken, values, evidence = more, moved, found
@@ -166,9 +156,10 @@ class Decider:
             return Decision(scales, none, start, -math.inf)
         joins = network.joined(np.flatnonzero(taken))
         node, squared = network.most_strained(information, values)
+        least = tuning.CERTAIN - joins * (tuning.CERTAIN + network.limit)
         return Decision(
-            scales, taken, values, evidence, CERTAIN - joins * (CERTAIN + network.limit),
-            node if squared > STRAINED else -1, self._chance(taken),
+            scales, taken, values, evidence, least,
+            node if squared > tuning.STRAINED else -1, self._chance(taken),
         )  # fmt: skip
 
     def decide(self, robots: int) -> tuple[Decision, list[Decision]]:
@@ -179,19 +170,19 @@ class Decider:
         """
 
         def better(best: Decision, other: Decision) -> Decision:
-            return other if other.gain - best.gain > LOOSENED else best
+            return other if other.gain - best.gain > tuning.LOOSER else best
 
-        best = self.at(np.full(robots, TIGHT))
+        best = self.at(np.full(robots, tuning.TIGHT))
         tried = [best]
-        for scale in SCALES[1:]:
+        for scale in tuning.SCALES[1:]:
             tried.append(self.at(np.full(robots, scale)))
             best = better(best, tried[-1])
             if best.is_published and all(
-                each.evidence < best.evidence - LOOSENED for each in tried[-2:]
+                each.evidence < best.evidence - tuning.LOOSER for each in tried[-2:]
             ):
                 break
         for robot in range(robots) if robots > 1 else ():
-            for scale in SCALES:
+            for scale in tuning.SCALES:
                 changed = np.where(np.arange(robots) == robot, scale, best.scales)
                 best = better(best, self.at(changed))
         return best, tried
@@ -216,7 +207,7 @@ class Decider:
                 return -math.inf, factor, decision.values
             return evidence, factor, values
 
-        best, least = fitted(1.0), PRECISE / decision.scales.min()
+        best, least = fitted(1.0), tuning.PRECISE / decision.scales.min()
         for change in (0.5, 2.0):
             while least <= best[1] * change < 64:
                 found = fitted(best[1] * change)

@@ -11,10 +11,10 @@ import numpy as np
 from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import breaks
+from stavpr_slam.pose_graph import breaks, tuning
 from stavpr_slam.pose_graph.blocks import added
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
-from stavpr_slam.pose_graph.decision import events, GROWN, TIGHT
+from stavpr_slam.pose_graph.decision import events
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extended
@@ -22,7 +22,6 @@ from stavpr_slam.pose_graph.solution import decided, DriveSolution, followed, NO
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-MAX_BREAKS = 4  # that are searched
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class PoseGraph:
     @property
     def scale(self) -> float:
         """Return the factor on the errors of the odometry that closures have shown, the worst."""
-        return float(self.scales.max(initial=TIGHT))
+        return float(self.scales.max(initial=tuning.TIGHT))
 
     @property
     def refused(self) -> float:
@@ -200,13 +199,13 @@ class PoseGraph:
         last, given = self._solution, (self.chain, self._closures)
         if self.settings.measured:
             return added(*given, NOTHING if final else last)
-        is_searched = not final and len(self._known) <= GROWN * self._searched
+        is_searched = not final and len(self._known) <= tuning.SEARCH * self._searched
         if isinstance(last, DriveSolution) and is_searched:
             return followed(*given, last) or decided(*given, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
         found = without = decided(*given)
-        for _ in range(MAX_BREAKS):
+        for _ in range(tuning.MAX_BREAKS):
             better = self._with_break(found)
             if better is None:
                 break
@@ -244,12 +243,12 @@ class PoseGraph:
             )
             if node is not None
         )
-        for node in [*nodes][:MAX_BREAKS]:
+        for node in [*nodes][: tuning.MAX_BREAKS]:
             self._split(node, True)
             after = decided(self.chain, self._closures)
             if (
-                self._more(before, after) >= breaks.GAIN
-                or after.decision.gain - before.decision.gain > breaks.EVIDENCE
+                self._more(before, after) >= tuning.GAIN
+                or after.decision.gain - before.decision.gain > tuning.EVIDENCE
             ):
                 return after
             self._split(node, False)

@@ -13,6 +13,7 @@ import math
 import numpy as np
 from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.runs import Runs
@@ -23,11 +24,7 @@ ANCHOR = 1e-4  # deviation of the pose of the first node, rad and m
 LOOSE_ANGLE, LOOSE_POSITION = 3.0, 1e3  # of a session that nothing joins to the others
 PLANAR = [3, 4, 2]  # x, y and yaw of a twist
 FLAT = 1e-6  # m and rad out of the plane that are none
-INLIER = 0.99  # part of right closures whose residuals are below the limit
-GROWTH = 2.0  # of the parameter of graduated non-convexity
-FIRST_STEPS, MAX_STEPS = 4, 25  # of Gauss and Newton: with all closures, and at most
 NONE = 1e-4  # weight of a closure that does not count
-CONVERGED = 1e-3  # change of the error, half the squared deviations, of a solution
 
 
 def room(nodes: np.ndarray, freedom: int) -> float:
@@ -74,7 +71,7 @@ class Network:
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
         self.room = room(initial, self.freedom)
         self._loose_determinant = float(np.log(loose).sum() / 2)
-        self.limit = float(chi2.ppf(INLIER, self.freedom))
+        self.limit = float(chi2.ppf(tuning.INLIER, self.freedom))
         self.information = np.linalg.inv(closures.covariance[:, at[:, None], at])
 
         # a factor for each variable: the odometry before it, a loose link, or an anchor
@@ -185,20 +182,20 @@ class Network:
         """
         weights, limit = np.ones(len(self.query)), self.limit
         squared = self.residuals(odometry, values)
-        for _ in range(0 if start else FIRST_STEPS):
+        for _ in range(0 if start else tuning.FIRST_STEPS):
             values, _ = self._step(values, weights)
             squared = self.residuals(odometry, values)
         if 2 * squared.max(initial=0.0) <= limit:
             return weights > 0, values
         mu = start or limit / (2 * squared.max() - limit)
-        for _ in range(MAX_STEPS):
+        for _ in range(tuning.MAX_STEPS):
             surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
             between = np.sqrt(limit * mu * (mu + 1) / squared.clip(surely)) - mu
             weights = np.where(squared >= never, 0.0, np.where(squared <= surely, 1.0, between))
             values, _ = self._step(values, weights)
             if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
                 break
-            squared, mu = self.residuals(odometry, values), mu * GROWTH
+            squared, mu = self.residuals(odometry, values), mu * tuning.GROWTH
         return weights > 0.5, values
 
     def solve(
@@ -214,10 +211,10 @@ class Network:
         """
         whole = np.concatenate([np.ones(len(values)), weights])
         error = float(self._solver.squared(values, odometry) @ whole)
-        for _ in range(MAX_STEPS):
+        for _ in range(tuning.MAX_STEPS):
             values, determinant = self._step(values, weights)
             before, error = error, float(self._solver.squared(values, odometry) @ whole)
-            if abs(before - error) < 2 * CONVERGED:
+            if abs(before - error) < 2 * tuning.CONVERGED:
                 break
         return values, error, determinant
 

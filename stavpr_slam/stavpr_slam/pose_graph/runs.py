@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-
-LONGEST = 10  # keyframes of a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,7 @@ class Runs:
         begins = (chain.previous < 0)[order]
         number = np.arange(count)
         start = np.maximum.accumulate(np.where(begins, number, 0))
-        chosen = begins | ((number - start) % LONGEST == 0)
+        chosen = begins | ((number - start) % tuning.LONGEST == 0)
         chosen[np.isin(order, list(ends))] = True
         own = np.maximum.accumulate(np.where(chosen, number, 0))  # variable at or before
         first = np.where(chosen & ~begins, own[number - 1], own)  # and before a variable

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
-JOINS = 8  # closures that join two sessions
-AGREEING = 0.25  # part of the closures between sessions that agree at least
-SAMPLE = 100  # closures between sessions that vote, and poses that they move, at most
 Pair = tuple[int, int]  # numbers of sessions, the lower one first
 
 
@@ -55,7 +53,7 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
     T, session, Z = chain.transforms, chain.session, closures.transform
     result, links = T.copy(), {}
     joined = weights(chain, closures).items()
-    joins = {pair for pair, weight in joined if weight >= JOINS and pair not in denied}
+    joins = {pair for pair, weight in joined if weight >= tuning.JOINS and pair not in denied}
     pairs = session_pairs(chain, closures).tolist()
     allowed = np.array([a == b or (a, b) in joins for a, b in pairs], bool)
     starts = {int(session[node]): int(node) for node in chain.starts()}
@@ -71,7 +69,7 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
         others = np.concatenate([closures.place[ahead], closures.query[back]])
         if len(others):
             own = np.concatenate([closures.query[ahead], closures.place[back]])
-            thin = np.linspace(0, len(own) - 1, min(SAMPLE, len(own))).astype(int)
+            thin = np.linspace(0, len(own) - 1, min(tuning.SAMPLE, len(own))).astype(int)
             motions = np.concatenate([Z[ahead], inverse(Z[back])])[thin]
             votes = result[others[thin]] @ motions @ inverse(T[own[thin]])
             best = _best(votes, T[mine])
@@ -90,13 +88,13 @@ def _best(votes: np.ndarray, transforms: np.ndarray) -> int:
     points = transforms[:: max(1, len(transforms) // 20), :3, 3]
     moved = np.einsum('nij,mj->nmi', votes[:, :3, :3], points) + votes[:, None, :3, 3]
     away = np.linalg.norm(moved[:, None] - moved[None], axis=3).mean(axis=2)
-    return int(np.argmin(np.quantile(away, AGREEING, axis=1)))
+    return int(np.argmin(np.quantile(away, tuning.AGREEING, axis=1)))
 
 
 def few(chain: KeyframeChain, closures: ClosureArrays, placement: Placement) -> set[Pair]:
     """Return the pairs of sessions that too few closures join, of those that are right."""
     joined = weights(chain, closures)
-    return {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
+    return {pair for pair in placement.pairs if joined.get(pair, 0) < tuning.JOINS}
 
 
 def extended(chain: KeyframeChain, solved: np.ndarray, placement: Placement) -> np.ndarray:

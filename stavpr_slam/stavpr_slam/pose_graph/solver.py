@@ -15,12 +15,11 @@ import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from stavpr_ros.compilation import kernel
+from stavpr_slam.pose_graph import tuning
 
 TINY = 1e-12  # twice the sine of an angle
 SMALL = 1e-5  # radians: of a rotation whose series are cut after two terms
 SERIES = 1e-2  # radians: the same of the derivative of the logarithm
-SPARE = 1.5  # times the active factors: a pattern of so many is used again
-FILLED = 6  # blocks for each active factor: a pattern with more is used again for 2 % more only
 PATTERNS = 16  # that are kept
 ALONE = 1e-9  # least part of its errors that a factor leaves to others
 
@@ -488,7 +487,7 @@ class Solver:
     def _pattern(self, active: np.ndarray, count: int) -> Pattern:
         used = active.sum()
         for each in self._patterns:
-            most = (SPARE if len(each.rows) < FILLED * used else 1.02) * used
+            most = (tuning.SPARE if len(each.rows) < tuning.FILLED * used else 1.02) * used
             if not (active & ~each.active).any() and each.active.sum() <= most:
                 return each
         self._patterns = [Pattern.of(self.ends, count, active), *self._patterns[: PATTERNS - 1]]
