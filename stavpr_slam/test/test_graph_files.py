@@ -270,18 +270,18 @@ def with_false(
     return graph_of([*edges, *false]), len(right)
 
 
-def kept(blocks, network, information, values, agree, own):
+def keep(blocks, inliers, values):
     """Return closures as they are."""
-    return agree, values
+    return inliers, values
 
 
 CASES = {  # of a rule: a graph that is wrong without it, and what replaces the rule
     'certain closures first': ('MIT', 0.1, 10, 0, 0, tuning, 'CERTAIN', 0.0),
     'rejected ones that may agree by now': ('MIT', 0.3, 1, 2, 0, blocks, 'PASSES', (False,)),
-    'those less probable than a place anywhere': ('MIT', 0.5, 1, 0, 0, Blocks, '_certain', kept),
-    'weak ones that leave for others': ('MIT', 0.3, 1, 0, 0, Blocks, '_swapped', kept),
+    'improbable ones go, one by one': ('MIT', 0.1, 10, 0, 0, Blocks, '_drop_improbable', keep),
+    'weak ones that leave for others': ('MIT', 0.3, 1, 0, 0, Blocks, '_swap_weak', keep),
     'one of ten nodes shows the factor': (
-        'MIT', 0.5, 10, 1, 40, Blocks, '_apart', lambda blocks, numbers: numbers,
+        'MIT', 0.5, 10, 1, 40, Blocks, '_one_per_run', lambda blocks, numbers: numbers,
     ),
     'blocks by time': ('MIT', 0.3, 1, 2, 0, tuning, 'BLOCKS', 1),
     'four times the limit': ('parking-garage', 0.1, 1, 0, 0, tuning, 'TAILS', 1.0),

@@ -254,7 +254,7 @@ def test_update_without_solution_leaves_new_closures_out(drive, monkeypatch):
     graph.update()
     accepted = graph.accepted
     fails = Mock(side_effect=[np.linalg.LinAlgError, None])
-    monkeypatch.setattr(graph_module, 'followed', fails)
+    monkeypatch.setattr(graph_module, 'follow', fails)
     graph.add_closure(closures[20])
     graph.update()
     assert graph.counts['failed'] == 1

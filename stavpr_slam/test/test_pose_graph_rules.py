@@ -165,7 +165,7 @@ def test_covariances_of_the_odometry_correct_the_stretch_that_slips(monkeypatch)
     assert error_with(covariances) < 0.6 * without
     constant = np.tile(np.diag([0.01] * 6), (len(odometry), 1, 1))
     assert error_with(constant) == error_with(0 * constant) == without
-    monkeypatch.setattr(keyframes, 'given_growth', lambda *_: None)
+    monkeypatch.setattr(keyframes, 'message_growth', lambda *_: None)
     assert error_with(covariances) == without
 
 

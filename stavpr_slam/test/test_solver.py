@@ -69,7 +69,7 @@ def test_step_is_that_of_gauss_and_newton(at, turn):
     weights = np.ones(len(ends))
     weights[-2:] = 0.3, 0.0
     solver = Solver(ends, motions, at)
-    squared = solver.squared(poses, information)
+    squared = solver.linearize(poses, information)
     errors = errors_of(ends, motions, poses)[:, at]
     np.testing.assert_allclose(
         squared, np.einsum('ni,nij,nj->n', errors, information, errors), rtol=1e-6, atol=1e-9
@@ -88,7 +88,7 @@ def test_deviations_are_by_the_errors_of_both_ends(at):
     chosen, weights = np.array([N, N + 1, N + 3]), np.ones(len(ends))
     weights[chosen] = 0
     solver = Solver(ends, motions, at)
-    solver.squared(poses, information)
+    solver.linearize(poses, information)
     errors, J = errors_of(ends, motions, poses)[:, at], derivatives(ends, motions, poses, at)
     W = block_diag(*(weights[:, None, None] * information))
     poses_covariance, expected = np.linalg.inv(J.T @ W @ J), []
@@ -103,12 +103,12 @@ def test_deviations_are_by_the_errors_of_both_ends(at):
 def test_step_without_a_factor_of_the_step_before_is_that_of_a_new_solver():
     ends, motions, information, poses = graph_of(SPATIAL, 0.1)
     solver, weights = Solver(ends, motions, SPATIAL), np.ones(len(ends))
-    solver.squared(poses, information)
+    solver.linearize(poses, information)
     solver.step(poses, weights)
     weights[-1] = 0
     again, _ = solver.step(poses, weights)
     fresh = Solver(ends, motions, SPATIAL)
-    fresh.squared(poses, information)
+    fresh.linearize(poses, information)
     np.testing.assert_allclose(again, fresh.step(poses, weights)[0], atol=1e-9)
 
 
@@ -116,7 +116,7 @@ def test_pose_without_factors_has_no_solution():
     ends, motions, information, poses = graph_of(PLANAR, 0.1)
     solver, weights = Solver(ends, motions, PLANAR), np.ones(len(ends))
     weights[(ends == N - 1).any(axis=1)] = 0.0
-    solver.squared(poses, information)
+    solver.linearize(poses, information)
     with pytest.raises(np.linalg.LinAlgError, match='no unique solution'):
         solver.step(poses, weights)
 

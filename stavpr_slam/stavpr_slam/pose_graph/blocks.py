@@ -9,7 +9,7 @@ and the part of all closures that are right: certain ones first, then those that
 The errors that the file states are right up to a factor, which the closures show.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -17,50 +17,48 @@ from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
-from stavpr_slam.pose_graph.sessions import extended, few, Pair, place, Placement
+from stavpr_slam.pose_graph.sessions import extend, Pair, place, Placement, weak_pairs
 from stavpr_slam.pose_graph.solution import Solution
-from stavpr_slam.pose_graph.solver import likelihoods, scaled, squares
+from stavpr_slam.pose_graph.solver import likelihoods, scale_errors, squares
 
 PASSES = False, True  # over the closures of a block: again for rejected ones that agree by now
-Found = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
+Inliers = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
 
 
+@dataclass(frozen=True, eq=False)
 class Beliefs:
     """
     What is known of n closures, and of the errors that the file states.
 
-    :param space: logarithm of the poses of the map, see :attr:`Network.room`.
+    :param space: logarithm of the poses of the map, :attr:`Network.room`.
     :param innovations: of each closure when it was compared with a solution at last, see
         :meth:`Solver.innovations`, in errors with the factor of the odometry.
+    :param factor: on the errors that the file states.
+    :param prior: logarithm of the odds that a closure is right.
+    :param search_count: closures of the last search of the factor.
     """
 
-    def __init__(self, space: float, innovations: np.ndarray) -> None:
-        self.space, self.innovations = space, innovations
-        self.factor = 1.0  # on the errors that the file states
-        self.prior = 0.0  # logarithm of the odds that a closure is right
-        self.searched = 0  # closures of the last search
+    space: float
+    innovations: np.ndarray
+    factor: float = 1.0
+    prior: float = 0.0
+    search_count: int = 0
 
-    def grown(self, space: float, count: int) -> 'Beliefs':
-        """Return a copy for a number of closures, and another map."""
-        result, known = Beliefs(space, unknown(count, self.innovations.shape[1])), self.innovations
-        result.innovations[: len(known)] = known[:count]
-        result.factor, result.prior, result.searched = self.factor, self.prior, self.searched
-        return result
+    def resize(self, space: float, count: int) -> 'Beliefs':
+        """Return a copy for a number of closures, of which new ones are improbable."""
+        rows = np.zeros((count, self.innovations.shape[1]))
+        rows[:, -1] = np.inf
+        rows[: len(self.innovations)] = self.innovations[:count]
+        return replace(self, space=space, innovations=rows)
 
     def odds(self, rows: np.ndarray) -> np.ndarray:
         """Return the logarithm of the odds that closures are right, by their innovations."""
         return self.prior + self.space + likelihoods(rows)
 
-    def show(self, rows: np.ndarray, factors: np.ndarray) -> None:
-        """Search the factor on all errors, in parts of the last one."""
-        tried = [1.0, *factors]
-        densities = np.array([likelihoods(scaled(rows, factor)) for factor in tried])
-        factor = float(tried[self._best(densities)])
-        self.innovations = scaled(self.innovations, factor)
-        self.factor *= factor
-
-    def _best(self, densities: np.ndarray) -> int:
-        """Return the best of k alternatives, the first of which needs no evidence, (k, n)."""
+    def search_factor(self, rows: np.ndarray, factors: np.ndarray) -> 'Beliefs':
+        """Return these with the best factor on all errors, in parts of the last one."""
+        factors = np.array([1.0, *factors])
+        densities = np.array([likelihoods(scale_errors(rows, factor)) for factor in factors])
         ratio, prior = np.exp((densities + self.space).clip(-50, 50)), np.array([[0.5]])
         for _ in range(tuning.MAX_STEPS):  # the part of the closures that are right
             right = prior * ratio / (prior * ratio + 1 - prior)
@@ -70,8 +68,11 @@ class Beliefs:
         is_certain = evidence >= tuning.CERTAIN * right.sum(axis=1)
         evidence[1:] = np.where(is_certain, evidence - tuning.LOOSER, -np.inf)[1:]
         best = int(np.argmax(evidence))
-        self.prior = math.log(prior[best, 0] / (1 - prior[best, 0]))
-        return best
+        return replace(
+            self, innovations=scale_errors(self.innovations, factors[best]),
+            factor=float(self.factor * factors[best]),
+            prior=math.log(prior[best, 0] / (1 - prior[best, 0])),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +82,9 @@ class MeasuredSolution(Solution):
     beliefs: Beliefs
 
 
-def unknown(count: int, width: int) -> np.ndarray:
-    """Return innovations of closures that were not compared yet: none is probable."""
-    result = np.zeros((count, width))
-    result[:, -1] = np.inf
-    return result
-
-
-def added(chain: KeyframeChain, closures: ClosureArrays, last: Solution) -> Solution:
+def decide_in_blocks(
+    chain: KeyframeChain, closures: ClosureArrays, last: Solution
+) -> MeasuredSolution:
     """
     Add new closures to the last solution, in blocks by time.
 
@@ -96,65 +92,67 @@ def added(chain: KeyframeChain, closures: ClosureArrays, last: Solution) -> Solu
     """
     denied = set[Pair]()
     while True:
-        found = _Blocks(chain, closures, last, place(chain, closures, denied)).solution()
-        pairs = few(chain, closures[found.accepted], found.placement)
+        solution = _Blocks(chain, closures, last, place(chain, closures, denied)).solution()
+        pairs = weak_pairs(chain, closures[solution.accepted], solution.placement)
         if not pairs:
-            return found
+            return solution
         denied |= pairs
 
 
 class _Blocks:
-    """Adds closures in blocks."""
+    """Adds closures in blocks; the numbers of closures and the network are of the present one."""
 
     def __init__(
         self, chain: KeyframeChain, closures: ClosureArrays, last: Solution, placement: Placement
     ) -> None:
         self._chain, self._closures, self._placement = chain, closures, placement
         self._latest = np.maximum(closures.query, closures.place)
-        count, self._known, self._nodes = len(closures), len(last.accepted), last.nodes
-        self._taken = np.zeros(count, bool)
-        self._taken[: self._known] = last.accepted & placement.allowed[: self._known]
-        network = Network(chain, placement.initial, closures, placement.links)
-        before = Beliefs(network.room, unknown(0, 2 * network.freedom + 1))
+        count, old, self._nodes = len(closures), len(last.accepted), last.nodes
+        self._is_old = np.arange(count) < old
+        self._accepted = np.zeros(count, bool)
+        self._accepted[:old] = last.accepted & placement.allowed[:old]
+        self._network = network = Network(chain, placement.initial, closures, placement.links)
+        beliefs = Beliefs(network.room, np.zeros((0, 2 * network.freedom + 1)))
         if isinstance(last, MeasuredSolution):
-            before = last.beliefs
-        self._beliefs = before.grown(network.room, count)
-        self._searches = count > 0 and count >= tuning.SEARCH * before.searched
+            beliefs = last.beliefs
+        self._beliefs = beliefs.resize(network.room, count)
+        self._searches = count > 0 and count >= tuning.SEARCH * beliefs.search_count
         if self._searches:
-            alone = self._apart(np.arange(count))
-            alone = alone[
-                chain.session[closures.query[alone]] == chain.session[closures.place[alone]]
-            ]
-            network.residuals(self._information(network), network.values(placement.initial))
-            rows = network.beside_odometry(alone)
-            new = alone >= self._known
-            self._beliefs.innovations[alone[new]] = rows[new]
-            self._beliefs.show(rows, tuning.FACTORS / self._beliefs.factor)
-            self._beliefs.searched = count
+            sample = self._one_per_run(np.arange(count))
+            ends = chain.session[closures.query[sample]], chain.session[closures.place[sample]]
+            sample = sample[ends[0] == ends[1]]
+            self._set_odometry()
+            network.residuals(self._odometry, network.values(placement.initial))
+            rows, new = network.beside_odometry(sample), ~self._is_old[sample]
+            self._beliefs.innovations[sample[new]] = rows[new]
+            factors = tuning.FACTORS / self._beliefs.factor
+            self._beliefs = self._beliefs.search_factor(rows, factors)
+            self._beliefs = replace(self._beliefs, search_count=count)
 
-    def _information(self, network: Network) -> np.ndarray:
+    def _set_odometry(self) -> None:
+        """Set the information of all factors of the network at the present errors."""
         factor = self._beliefs.factor
-        return network.odometry(np.full(len(self._chain), factor), factor)
+        self._odometry = self._network.odometry(np.full(len(self._chain), factor), factor)
 
-    def _apart(self, numbers: np.ndarray) -> np.ndarray:
+    def _one_per_run(self, numbers: np.ndarray) -> np.ndarray:
         """Return closures of which neighboring nodes have one: groups may be wrong together."""
-        found = np.unique(self._latest[numbers] // tuning.LONGEST, return_index=True)[1]
-        return np.asarray(numbers[found])
+        runs = self._latest[numbers] // tuning.LONGEST
+        return np.asarray(numbers[np.unique(runs, return_index=True)[1]])
 
-    def solution(self) -> Solution:
+    def solution(self) -> MeasuredSolution:
         """Return the solution with all closures."""
-        count, seen = len(self._chain), np.arange(len(self._taken)) < self._known
-        step, is_whole = max(1, count // tuning.BLOCKS), not self._known
+        count, seen, is_whole = len(self._chain), self._is_old.copy(), not self._is_old.any()
+        step = max(1, count // tuning.BLOCKS)
         for end in (*range(len(self._nodes) + step, count, step), count):
-            part = self._chain.until(end)
-            self._nodes = extended(part, self._nodes, self._placement)
-            came = self._placement.allowed & (self._latest < end)
-            if (came & ~seen).any() or (is_whole and end == count):
-                self._decide(part, np.flatnonzero(came), ~seen[came], is_whole and end == count)
-            seen |= came
+            part, is_last = self._chain.until(end), is_whole and end == count
+            self._nodes = extend(part, self._nodes, self._placement)
+            usable = self._placement.allowed & (self._latest < end)
+            if (usable & ~seen).any() or is_last:
+                self._decide(part, np.flatnonzero(usable), ~seen[usable], is_last)
+            seen |= usable
         scales = np.full(len(self._chain.robots), self._beliefs.factor)
         return MeasuredSolution(
-            self._nodes, self._taken, self._taken, scales, self._placement, self._beliefs
+            self._nodes, self._accepted, self._accepted, scales, self._placement, self._beliefs
         )
 
     def _decide(self, part: KeyframeChain, own: np.ndarray, new: np.ndarray, swaps: bool) -> None:
@@ -165,98 +163,89 @@ class _Blocks:
         :param new: those of them that are new, bool.
         :param swaps: leave out weak ones on trial.
         """
-        beliefs = self._beliefs
-        network = Network(part, self._nodes, self._closures[own], self._placement.links)
-        network.limit, network.room = network.limit * tuning.TAILS, beliefs.space
-        values, taken = network.values(self._nodes), self._taken[own]
-        information = self._information(network)
-        away = network.residuals(information, values)
+        self._own = own
+        self._network = Network(part, self._nodes, self._closures[own], self._placement.links)
+        network, limit = self._network, self._network.limit * tuning.TAILS
+        network.limit, network.room = limit, self._beliefs.space
+        values, accepted = network.values(self._nodes), self._accepted[own]
+        self._set_odometry()
+        residuals = network.residuals(self._odometry, values)
         for again in PASSES:
-            rows = beliefs.innovations[own]
+            rows = self._beliefs.innovations[own]
             if again:
-                near = away < network.limit
-                fits = squares(rows) <= network.limit
-                new = ~taken & (near | (fits & (beliefs.odds(rows) > 0)))
+                fits = (squares(rows) <= limit) & (self._beliefs.odds(rows) > 0)
+                new = ~accepted & ((residuals < limit) | fits)
             if not new.any():
                 break
-            rows[new] = network.innovations(taken, np.flatnonzero(new))
-            beliefs.innovations[own] = rows
+            rows[new] = network.innovations(accepted, np.flatnonzero(new))
+            self._beliefs.innovations[own] = rows
             if self._searches:
-                compared = self._apart(np.flatnonzero(np.isfinite(beliefs.innovations[:, -1])))
-                factors = tuning.FACTORS[tuning.FACTORS < 1]
-                beliefs.show(beliefs.innovations[compared], 1 / factors)
-                information, rows = self._information(network), beliefs.innovations[own]
-            passes = new & (squares(rows) <= network.limit)
-            passes &= beliefs.odds(rows) > (0 if again else tuning.CERTAIN)
-            passes |= new & network.joining(taken)
+                rows, factors = self._beliefs.innovations, tuning.FACTORS[tuning.FACTORS < 1]
+                sample = self._one_per_run(np.flatnonzero(np.isfinite(rows[:, -1])))
+                self._beliefs = self._beliefs.search_factor(rows[sample], 1 / factors)
+                self._set_odometry()
+                rows = self._beliefs.innovations[own]
+            passes = (squares(rows) <= limit) & (self._beliefs.odds(rows) > tuning.CERTAIN)
+            passes = new & (passes | network.new_joins(accepted))
             if not passes.any():
                 continue
-            agree, values = self._consistent(network, information, values, taken | passes)
-            agree, values = self._certain(network, information, values, agree, own)
-            away = network.residuals(information, values)
-            if (agree == taken).all():
+            inliers, values = self._drop_improbable(*self._fit(accepted | passes, values))
+            residuals = network.residuals(self._odometry, values)
+            if (inliers == accepted).all():
                 break
-            taken = agree
-        if swaps and taken.any():
-            taken, values = self._swapped(network, information, values, taken, own)
-        self._taken[own], self._nodes = taken, network.nodes(values)
+            accepted = inliers
+        if swaps and accepted.any():
+            accepted, values = self._swap_weak(accepted, values)
+        self._accepted[own], self._nodes = accepted, network.nodes(values)
 
-    def _consistent(
-        self, network: Network, information: np.ndarray, values: np.ndarray, among: np.ndarray
-    ) -> Found:
+    def _fit(self, chosen: np.ndarray, values: np.ndarray) -> Inliers:
         """Solve for closures, without those that contradict others."""
-        moved, _, _ = network.solve(information, values, among * 1.0)
-        agree = among & (network.residuals(information, moved) <= network.limit)
-        if (agree != among).any():
-            moved, _, _ = network.solve(information, moved, agree * 1.0)
-        return agree, moved
+        network, odometry = self._network, self._odometry
+        values, _ = network.fit(odometry, chosen, values)
+        inliers = chosen & (network.residuals(odometry, values) <= network.limit)
+        if (inliers != chosen).any():
+            values, _ = network.fit(odometry, inliers, values)
+        return inliers, values
 
-    def _certain(
-        self, network: Network, information: np.ndarray, values: np.ndarray, agree: np.ndarray,
-        own: np.ndarray,
-    ) -> Found:  # fmt: skip
+    def _drop_improbable(self, inliers: np.ndarray, values: np.ndarray) -> Inliers:
         """
         Leave out, one by one, closures that are less probable than a place anywhere.
 
         A false one may have a small residual: it bends the odometry, and without it is far away.
         """
-        beliefs = self._beliefs
-        while agree.any():
-            chosen = np.flatnonzero(agree)
-            odds = beliefs.odds(beliefs.innovations[own[chosen]])
-            chosen = chosen[np.argsort(odds)[: tuning.WEAKEST]]
-            network.residuals(information, values)
-            rows = beliefs.innovations[own[chosen]] = network.innovations(agree, chosen)
-            odds = beliefs.odds(rows)
+        network, rows = self._network, self._beliefs.innovations
+        while inliers.any():
+            weak = np.flatnonzero(inliers)
+            weak = weak[np.argsort(self._beliefs.odds(rows[self._own[weak]]))[: tuning.WEAKEST]]
+            network.residuals(self._odometry, values)
+            rows[self._own[weak]] = network.innovations(inliers, weak)
+            odds = self._beliefs.odds(rows[self._own[weak]])
             if odds.min() >= 0:
                 break
-            agree = agree & (np.arange(len(agree)) != chosen[np.argmin(odds)])
-            values, _, _ = network.solve(information, values, agree * 1.0)
-        return agree, values
+            inliers = inliers & (np.arange(len(inliers)) != weak[np.argmin(odds)])
+            values, _ = network.fit(self._odometry, inliers, values)
+        return inliers, values
 
-    def _swapped(
-        self, network: Network, information: np.ndarray, values: np.ndarray, taken: np.ndarray,
-        own: np.ndarray,
-    ) -> Found:  # fmt: skip
+    def _swap_weak(self, accepted: np.ndarray, values: np.ndarray) -> Inliers:
         """Leave out a weak closure and those beside it, for others, where that is evidence."""
-        beliefs, numbers = self._beliefs, np.arange(len(taken))
-        _, evidence = network.fit(information, taken, values)
-        odds = beliefs.odds(beliefs.innovations[own])
-        for weak in np.argsort(np.where(taken, odds, np.inf))[: tuning.WEAKEST]:
-            away = np.abs([each - each[weak] for each in (network.query, network.place)])
+        network, odometry, numbers = self._network, self._odometry, np.arange(len(accepted))
+        _, evidence = network.fit(odometry, accepted, values)
+        odds = self._beliefs.odds(self._beliefs.innovations[self._own])
+        for weak in np.argsort(np.where(accepted, odds, np.inf))[: tuning.WEAKEST]:
+            away = np.abs([ends - ends[weak] for ends in (network.query, network.place)])
             others = away.max(axis=0) >= tuning.LONGEST
-            trial = taken & others
-            new = numbers[others & ~taken]
+            trial = accepted & others
+            new = numbers[others & ~accepted]
             new = new[np.argsort(-odds[new])[: tuning.PLAUSIBLE]]
-            if not taken[weak] or not len(new):
+            if not accepted[weak] or not len(new):
                 continue
-            moved, _, _ = network.solve(information, values, trial * 1.0)
-            network.residuals(information, moved)
+            trial_values, _ = network.fit(odometry, trial, values)
+            network.residuals(odometry, trial_values)
             rows = network.innovations(trial, new)
-            fits = (squares(rows) <= network.limit) & (beliefs.odds(rows) > 0)
+            fits = (squares(rows) <= network.limit) & (self._beliefs.odds(rows) > 0)
             trial |= np.isin(numbers, new[fits])
-            trial, moved = self._consistent(network, information, moved, trial)
-            moved, found = network.fit(information, trial, moved)
-            if found > evidence:
-                taken, values, evidence = trial, moved, found
-        return taken, values
+            trial, trial_values = self._fit(trial, trial_values)
+            trial_values, trial_evidence = network.fit(odometry, trial, trial_values)
+            if trial_evidence > evidence:
+                accepted, values, evidence = trial, trial_values, trial_evidence
+        return accepted, values

@@ -10,25 +10,25 @@ from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 
 def find(
-    chain: KeyframeChain, solved: np.ndarray, taken: np.ndarray, closures: ClosureArrays
+    chain: KeyframeChain, solved: np.ndarray, accepted: np.ndarray, closures: ClosureArrays
 ) -> list[int]:
     """
     Return the breaks that let most rejected closures agree, and then most of the rest.
 
     :param solved: transforms of all nodes by the robust solution, (N, 4, 4).
-    :param taken: whether each closure agrees with it, shape (n,).
+    :param accepted: whether each closure agrees with it, shape (n,).
     """
     query, place = closures.query, closures.place
-    found: list[tuple[int, int | None]] = []
+    candidates: list[tuple[int, int | None]] = []
     for session in np.unique(chain.session[query]).tolist():
         here = chain.session[query] == session
-        own = np.flatnonzero(~taken & here)
+        own = np.flatnonzero(~accepted & here)
         own = own[:: len(own) // tuning.COMPARED + 1]
         if len(own) < tuning.SUPPORT:
             continue
-        moved = solved[place[own]] @ closures.transform[own] @ inverse(solved[query[own]])
+        votes = solved[place[own]] @ closures.transform[own] @ inverse(solved[query[own]])
         points = solved[query[own], :3, 3].T
-        at = moved[:, :3, :3] @ points + moved[:, :3, 3:]
+        at = votes[:, :3, :3] @ points + votes[:, :3, 3:]
         wide = np.linalg.eigvalsh(closures.covariance[own, 3:, 3:])[:, -1] ** 0.5
         away = np.linalg.norm(at - np.einsum('nin->in', at), axis=1)
         agree = (away < tuning.SPREAD * (1 + np.maximum.outer(wide, wide))).astype(np.float32)
@@ -43,20 +43,22 @@ def find(
             nodes = np.unique(query[own])[:: tuning.SUPPORT // 4]
             members = max((most((query[own] >= node) & free) for node in nodes), key=np.sum)
             best, start = own[members], query[own[members]].min(initial=len(chain))
-            before = np.flatnonzero(taken & here & (query < start))
+            before = np.flatnonzero(accepted & here & (query < start))
             if not len(before):
                 before = own[most(query[own] < start)]
-            found.append((-len(best), _between(chain, query, before, best)))
+            candidates.append((-len(best), _between(chain, query, before, best)))
             free &= ~members
-    found = sorted(found, key=lambda each: each[0])[: tuning.SETS]
-    return [node for _, node in found if node is not None]
+    candidates = sorted(candidates, key=lambda candidate: candidate[0])[: tuning.SETS]
+    return [node for _, node in candidates if node is not None]
 
 
-def strained(chain: KeyframeChain, taken: np.ndarray, query: np.ndarray, node: int) -> int | None:
-    """Return the break between the closures beside a strained node, as :func:`find`."""
+def find_at_bend(
+    chain: KeyframeChain, accepted: np.ndarray, query: np.ndarray, node: int
+) -> int | None:
+    """Return the break between the closures beside a bend of the odometry, as :func:`find`."""
     if node < 0:
         return None
-    own = taken & (chain.session[query] == chain.session[node])
+    own = accepted & (chain.session[query] == chain.session[node])
     before, behind = np.flatnonzero(own & (query < node)), np.flatnonzero(own & (query >= node))
     return _between(chain, query, before, behind)
 

@@ -30,13 +30,9 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
     :param query, place: nodes, (n,).
     """
     at = np.stack(
-        [chain.travelled[each] + FAR * chain.session[each] for each in (query, place)], 1
+        [chain.travelled[nodes] + FAR * chain.session[nodes] for nodes in (query, place)], 1
     )
-    near = (
-        KDTree(at).query_pairs(tuning.GAP, np.inf, output_type='ndarray')
-        if len(at)
-        else np.zeros((0, 2), int)
-    )
+    near = KDTree(at).query_pairs(tuning.GAP, np.inf, output_type='ndarray')
     graph = coo_matrix((np.ones(len(near)), near.T), (len(at),) * 2)
     numbers: np.ndarray = connected_components(graph, directed=False)[1]
     return numbers
@@ -48,19 +44,19 @@ class Decision:
     Which closures agree, with one factor on the errors of the odometry, and the evidence.
 
     :param scales: factors on the errors of the odometry of each robot.
-    :param agreeing, values: closures of the robust solution, shape (n,), bool, and its variables.
+    :param inliers, values: closures of the robust solution, shape (n,), bool, and its variables.
     :param evidence: of these closures.
     :param least: evidence from which the solution is published.
-    :param strained: node behind the part of the odometry that it bends most; -1 = none.
+    :param bend: node behind the part of the odometry that it bends most; -1 = none.
     :param chance: minus the logarithm of the probability to draw these events.
     """
 
     scales: np.ndarray
-    agreeing: np.ndarray
+    inliers: np.ndarray
     values: np.ndarray
     evidence: float
     least: float = 0.0
-    strained: int = -1
+    bend: int = -1
     chance: float = 0.0
 
     @property
@@ -69,9 +65,9 @@ class Decision:
         return self.evidence >= self.least
 
     @property
-    def taken(self) -> np.ndarray:
+    def accepted(self) -> np.ndarray:
         """Return whether each closure is right, shape (n,), bool; without evidence none is."""
-        return self.agreeing & self.is_published
+        return self.inliers & self.is_published
 
     @property
     def gain(self) -> float:
@@ -97,42 +93,42 @@ class Decider:
         """Return the information of all factors at factors on the errors of each robot."""
         return self._network.odometry(scales[self._chain.robot])
 
-    def representatives(self, taken: np.ndarray) -> np.ndarray:
+    def representatives(self, chosen: np.ndarray) -> np.ndarray:
         """Return the closure in the middle of each event, (m,)."""
-        numbers = np.flatnonzero(taken)
+        numbers = np.flatnonzero(chosen)
         at = self._chain.travelled[self._network.query[numbers]]
         numbers = numbers[np.lexsort((at, self._events[numbers]))]
         _, first, count = np.unique(self._events[numbers], return_index=True, return_counts=True)
-        found: np.ndarray = numbers[first + count // 2]
-        return found
+        middle: np.ndarray = numbers[first + count // 2]
+        return middle
 
-    def counted(self, taken: np.ndarray, independent: np.ndarray) -> np.ndarray:
+    def thin(self, chosen: np.ndarray, independent: np.ndarray) -> np.ndarray:
         """
         Return which of the closures that are taken count in an estimate, shape (n,), bool.
 
         :param independent: closures whose errors do not correlate, shape (n,), bool; of other
             events one closure counts.
         """
-        counted, own = taken & independent, self.representatives(taken)
-        counted[own[~np.isin(self._events[own], self._events[counted])]] = True
-        return counted
+        result, own = chosen & independent, self.representatives(chosen)
+        result[own[~np.isin(self._events[own], self._events[result])]] = True
+        return result
 
-    def _evidence(self, information: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
+    def _evidence(self, information: np.ndarray, inliers: np.ndarray, values: np.ndarray) -> float:
         """Return the evidence of closures, of which one of each event counts."""
-        counted = np.zeros_like(taken)
-        counted[self.representatives(taken)] = True
+        counted = np.zeros_like(inliers)
+        counted[self.representatives(inliers)] = True
         return self._network.fit(information, counted, values)[1]
 
-    def _chance(self, taken: np.ndarray) -> float:
+    def _chance(self, inliers: np.ndarray) -> float:
         """
         Return minus the logarithm of the probability to draw the events that are taken.
 
         Events are drawn one by one, each by its number of closures, in any order: of n events of
         one size, k have 1 / binomial(n, k).
         """
-        sizes = np.sort(np.bincount(self._events[taken]))[::-1]
+        sizes = np.sort(np.bincount(self._events[inliers]))[::-1]
         sizes = sizes[sizes > 0]
-        rest = len(taken) - np.cumsum(sizes) + sizes
+        rest = len(inliers) - np.cumsum(sizes) + sizes
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
     def at(self, scales: np.ndarray) -> Decision:
@@ -145,21 +141,21 @@ class Decider:
         information = self.information(scales)
         none, start = np.zeros(len(network.query), bool), self._start
         try:
-            taken, values = network.robust(information, start)
-            evidence = self._evidence(information, taken, values)
-            if taken.any():  # closures beside them may agree by now
-                more, moved = network.robust(information, values, tuning.AGAIN)
-                found = self._evidence(information, more, moved)
-                if found > evidence and more.sum() > taken.sum():
-                    taken, values, evidence = more, moved, found
+            inliers, values = network.robust(information, start)
+            evidence = self._evidence(information, inliers, values)
+            if inliers.any():  # closures beside them may agree by now
+                trial, trial_values = network.robust(information, values, tuning.AGAIN)
+                trial_evidence = self._evidence(information, trial, trial_values)
+                if trial_evidence > evidence and trial.sum() > inliers.sum():
+                    inliers, values, evidence = trial, trial_values, trial_evidence
         except np.linalg.LinAlgError:
             return Decision(scales, none, start, -math.inf)
-        joins = network.joined(np.flatnonzero(taken))
-        node, squared = network.most_strained(information, values)
+        joins = network.count_joins(np.flatnonzero(inliers))
+        node, deviation = network.most_strained(information, values)
         least = tuning.CERTAIN - joins * (tuning.CERTAIN + network.limit)
         return Decision(
-            scales, taken, values, evidence, least,
-            node if squared > tuning.STRAINED else -1, self._chance(taken),
+            scales, inliers, values, evidence, least,
+            node if deviation > tuning.STRAINED else -1, self._chance(inliers),
         )  # fmt: skip
 
     def decide(self, robots: int) -> tuple[Decision, list[Decision]]:
@@ -173,19 +169,19 @@ class Decider:
             return other if other.gain - best.gain > tuning.LOOSER else best
 
         best = self.at(np.full(robots, tuning.TIGHT))
-        tried = [best]
+        trials = [best]
         for scale in tuning.SCALES[1:]:
-            tried.append(self.at(np.full(robots, scale)))
-            best = better(best, tried[-1])
+            trials.append(self.at(np.full(robots, scale)))
+            best = better(best, trials[-1])
             if best.is_published and all(
-                each.evidence < best.evidence - tuning.LOOSER for each in tried[-2:]
+                trial.evidence < best.evidence - tuning.LOOSER for trial in trials[-2:]
             ):
                 break
         for robot in range(robots) if robots > 1 else ():
             for scale in tuning.SCALES:
-                changed = np.where(np.arange(robots) == robot, scale, best.scales)
-                best = better(best, self.at(changed))
-        return best, tried
+                other = np.where(np.arange(robots) == robot, scale, best.scales)
+                best = better(best, self.at(other))
+        return best, trials
 
     def estimate(
         self, decision: Decision, independent: np.ndarray
@@ -193,13 +189,13 @@ class Decider:
         """
         Estimate the variables at the errors of the odometry that the closures show.
 
-        :param independent: as in :meth:`counted`.
+        :param independent: as in :meth:`thin`.
         :returns: the factors on the errors of each robot, the variables, and the closures that
             count, shape (n,), bool.
         """
-        counted = self.counted(decision.taken, independent)
+        counted = self.thin(decision.accepted, independent)
 
-        def fitted(factor: float) -> tuple[float, float, np.ndarray]:
+        def fit(factor: float) -> tuple[float, float, np.ndarray]:
             information = self.information(factor * decision.scales)
             try:
                 values, evidence = self._network.fit(information, counted, decision.values)
@@ -207,11 +203,11 @@ class Decider:
                 return -math.inf, factor, decision.values
             return evidence, factor, values
 
-        best, least = fitted(1.0), tuning.PRECISE / decision.scales.min()
+        best, least = fit(1.0), tuning.PRECISE / decision.scales.min()
         for change in (0.5, 2.0):
             while least <= best[1] * change < 64:
-                found = fitted(best[1] * change)
-                if found[0] <= best[0]:
+                trial = fit(best[1] * change)
+                if trial[0] <= best[0]:
                     break
-                best = found
+                best = trial
         return best[1] * decision.scales, best[2], counted

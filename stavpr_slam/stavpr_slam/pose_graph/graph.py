@@ -12,13 +12,13 @@ from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks, tuning
-from stavpr_slam.pose_graph.blocks import added
+from stavpr_slam.pose_graph.blocks import decide_in_blocks
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
 from stavpr_slam.pose_graph.decision import events
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
-from stavpr_slam.pose_graph.sessions import extended
-from stavpr_slam.pose_graph.solution import decided, DriveSolution, followed, NOTHING, Solution
+from stavpr_slam.pose_graph.sessions import extend
+from stavpr_slam.pose_graph.solution import decide_anew, DriveSolution, follow, NOTHING, Solution
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
@@ -64,7 +64,7 @@ class PoseGraph:
         """Forget everything."""
         self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
         self._pending: list[Closure] = []
-        self._known: list[Closure] = []  # those between nodes
+        self._sources: list[Closure] = []  # those between nodes
         self._closures: ClosureArrays = between_nodes([])  # of them
         self._solution = NOTHING
         self._searched = 0  # closures of the last search
@@ -129,12 +129,12 @@ class PoseGraph:
 
     def _resolve(self) -> None:
         """Find the nodes of the closures that wait."""
-        waiting, found = [], []
+        waiting, rows = [], []
         for closure in self._pending:
-            resolved = self._resolved(closure)
-            if resolved is not None:
-                self._known.append(closure)
-                found.append(resolved)
+            row = self._row(closure)
+            if row is not None:
+                self._sources.append(closure)
+                rows.append(row)
                 continue
             ahead = self.chain.is_ahead
             if ahead(closure.query_stamp, closure.query_robot) or (
@@ -144,10 +144,10 @@ class PoseGraph:
             else:
                 self.counts['unknown stamp'] += 1
         self._pending = waiting
-        both = np.concatenate([self._closures, between_nodes(found)])
+        both = np.concatenate([self._closures, between_nodes(rows)])
         self._closures = both.view(np.recarray)
 
-    def _resolved(self, closure: Closure) -> tuple[Any, ...] | None:
+    def _row(self, closure: Closure) -> tuple[Any, ...] | None:
         query = self.chain.find(closure.query_stamp, closure.query_robot)
         place = self._place(closure)
         if query is None or place is None or query[0] == place[0]:
@@ -182,41 +182,41 @@ class PoseGraph:
             return self.solved
         last = self._solution
         solved = len(last.accepted)
-        if not final and len(self._known) == solved:
-            nodes = extended(self.chain, last.nodes, last.placement)
+        if not final and len(self._sources) == solved:
+            nodes = extend(self.chain, last.nodes, last.placement)
             self._solution = replace(last, nodes=nodes)
             return self.solved
         try:
             self._solution = self._solve(final)
         except np.linalg.LinAlgError:
-            self.counts['failed'] += len(self._known) - solved
-            del self._known[solved:]
+            self.counts['failed'] += len(self._sources) - solved
+            del self._sources[solved:]
             self._closures = self._closures[:solved]
             self._solution = self._solve(final)
         return self.solved
 
     def _solve(self, final: bool) -> Solution:
-        last, given = self._solution, (self.chain, self._closures)
+        last, graph = self._solution, (self.chain, self._closures)
         if self.settings.measured:
-            return added(*given, NOTHING if final else last)
-        is_searched = not final and len(self._known) <= tuning.SEARCH * self._searched
-        if isinstance(last, DriveSolution) and is_searched:
-            return followed(*given, last) or decided(*given, last.decision.scales)
+            return decide_in_blocks(*graph, NOTHING if final else last)
+        follows = not final and len(self._sources) <= tuning.SEARCH * self._searched
+        if isinstance(last, DriveSolution) and follows:
+            return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
-        found = without = decided(*given)
+        solution = without = decide_anew(*graph)
         for _ in range(tuning.MAX_BREAKS):
-            better = self._with_break(found)
+            better = self._with_break(solution)
             if better is None:
                 break
-            found = better
+            solution = better
         # where none is accepted without breaks, a few false runs agree with them
-        if not without.accepted.any() and found.accepted.sum() <= found.rejected:
+        if not without.accepted.any() and solution.accepted.sum() <= solution.rejected:
             for node in self.chain.splits[::-1]:
                 self._split(node, False)
-            found = without
-        self._searched = len(self._known)
-        return found
+            solution = without
+        self._searched = len(self._sources)
+        return solution
 
     def _split(self, node: int, begins: bool) -> None:
         """Begin a session at a node, or end it; closures between it and the one before change."""
@@ -228,24 +228,24 @@ class PoseGraph:
             self.chain.merge_session(node)
         beside = np.isin((self._closures.query, self._closures.place), (before, node)).any(axis=0)
         for number in np.flatnonzero(beside):
-            resolved = self._resolved(self._known[number])
-            if resolved is not None:
-                self._closures[number] = resolved
+            row = self._row(self._sources[number])
+            if row is not None:
+                self._closures[number] = row
 
     def _with_break(self, before: DriveSolution) -> DriveSolution | None:
         """Begin a session where closures prove that the robot was carried; None = nowhere."""
         nodes = dict.fromkeys(
             node
-            for solved, agreeing, strained in before.tried
+            for solved, inliers, bend in before.trials
             for node in (
-                *breaks.find(self.chain, solved, agreeing, self._closures),
-                breaks.strained(self.chain, agreeing, self._closures.query, strained),
+                *breaks.find(self.chain, solved, inliers, self._closures),
+                breaks.find_at_bend(self.chain, inliers, self._closures.query, bend),
             )
             if node is not None
         )
         for node in [*nodes][: tuning.MAX_BREAKS]:
             self._split(node, True)
-            after = decided(self.chain, self._closures)
+            after = decide_anew(self.chain, self._closures)
             if (
                 self._more(before, after) >= tuning.GAIN
                 or after.decision.gain - before.decision.gain > tuning.EVIDENCE
@@ -275,7 +275,8 @@ class PoseGraph:
     def edges(self) -> list[GraphEdge]:
         """Return all closures between nodes."""
         ends = self._closures.query, self._closures.place, self._solution.accepted
-        return [GraphEdge(*row) for row in zip(*(each.tolist() for each in ends), strict=False)]
+        rows = zip(*(values.tolist() for values in ends), strict=False)
+        return [GraphEdge(*row) for row in rows]
 
     @property
     def accepted(self) -> int:
@@ -311,10 +312,10 @@ class PoseGraph:
         :param odometry: at the stamp, shape (7,); without it, that between keyframes is
             interpolated.
         """
-        found = self.chain.find(stamp, robot)
-        if found is None or found[0] >= len(self.solved):
+        place = self.chain.find(stamp, robot)
+        if place is None or place[0] >= len(self.solved):
             return None
-        node, motion = found
+        node, motion = place
         if odometry is not None:
             motion = inverse(self.chain.transforms[node]) @ matrices(odometry)
         return to_poses(self.solved[node] @ motion)
@@ -350,6 +351,6 @@ def optimize(
     for closure in closures:
         graph.add_closure(closure)
     graph.update(final=True)
-    found = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
+    poses = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
     missing = np.full(7, np.nan)
-    return np.array([missing if pose is None else pose for pose in found]), graph
+    return np.array([missing if pose is None else pose for pose in poses]), graph

@@ -11,7 +11,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.units import SECOND
-from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
+from stavpr_slam.pose_graph.path_errors import LEAST, message_growth, OdometryNoise, step_errors
 from stavpr_slam.pose_graph.track import OdometryTrack
 from stavpr_slam.pose_graph.transforms import adjoints
 
@@ -134,8 +134,8 @@ class KeyframeChain:
         node = current.nodes[-1]
         step = inverse(self.transforms[node]) @ matrices(pose)
         near = np.linalg.norm(step[:3, 3]) < self._settings.distance
-        turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
-        is_keyframe = bool(turned or not near)
+        turns = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
+        is_keyframe = bool(turns or not near)
         current.tail = stamp, pose
         current.track.add(stamp, pose, is_keyframe)
         if is_keyframe:
@@ -151,9 +151,9 @@ class KeyframeChain:
             return f'the stamps jumped back by {-seconds:.3f} s'
         if seconds > self._settings.max_gap:
             return f'no odometry for {seconds:.1f} s'
-        moved = float(np.linalg.norm(pose[:3] - current.tail[1][:3]))
-        if seconds >= 0 and moved > max(2.0, self._settings.max_speed * seconds):
-            return f'the odometry jumped by {moved:.1f} m'
+        length = float(np.linalg.norm(pose[:3] - current.tail[1][:3]))
+        if seconds >= 0 and length > max(2.0, self._settings.max_speed * seconds):
+            return f'the odometry jumped by {length:.1f} m'
         return ''
 
     def _append(
@@ -172,11 +172,11 @@ class KeyframeChain:
             local[:, :3, 3] -= row['origin']
             length = np.linalg.norm(local[1, :3, 3] - local[0, :3, 3])
             row['travelled'] = before['travelled'] + length
-            grown = step_errors(local, self._noise)
-            given = given_growth(current.spread, covariance, local)
-            if given is not None:
-                grown = LEAST * grown + given
-            row['spread'] = before['spread'] + grown
+            growth = step_errors(local, self._noise)
+            stated = message_growth(current.spread, covariance, local)
+            if stated is not None:
+                growth = LEAST * growth + stated
+            row['spread'] = before['spread'] + growth
         current.spread = covariance
         current.nodes.append(node)
         current.begins.append(stamp)
@@ -219,11 +219,11 @@ class KeyframeChain:
         After a split it is the keyframe after the stamp, where that is on the same side. None
         = no odometry at this stamp; the latest recording counts where stamps repeat.
         """
-        for each in reversed(self._recordings):
-            first, last = each.track.span
-            if each.robot == robot and first <= stamp <= last:
-                node = each.nodes[bisect_right(each.begins, stamp) - 1]
-                return node, inverse(self.transforms[node]) @ matrices(each.track.at(stamp))
+        for recording in reversed(self._recordings):
+            first, last = recording.track.span
+            if recording.robot == robot and first <= stamp <= last:
+                node = recording.nodes[bisect_right(recording.begins, stamp) - 1]
+                return node, inverse(self.transforms[node]) @ matrices(recording.track.at(stamp))
         return None
 
     def motion(self, start: int, end: int, robot: str = '') -> np.ndarray | None:
@@ -249,8 +249,8 @@ class KeyframeChain:
                 continue
             stamps, poses = each.track.kept
             nodes = np.array(each.nodes)[np.searchsorted(each.begins, stamps, 'right') - 1]
-            known = nodes < len(solved)
-            rows.append((stamps[known], matrices(poses[known]), nodes[known]))
+            is_solved = nodes < len(solved)
+            rows.append((stamps[is_solved], matrices(poses[is_solved]), nodes[is_solved]))
         stamps, odometry, own = (np.concatenate(each) for each in zip(*rows, strict=True))
         return stamps, odometry, solved[own] @ inverse(self.transforms[own]) @ odometry
 
@@ -282,9 +282,9 @@ class KeyframeChain:
 
     def merge_session(self, node: int) -> None:
         """Let a session that began by a split at a node be part of the one before again."""
-        ended, before = self.session[node], self._cuts.pop(node)
-        self.session[self.session == ended] = self.session[before]
-        self.session[self.session > ended] -= 1
+        end, before = self.session[node], self._cuts.pop(node)
+        self.session[self.session == end] = self.session[before]
+        self.session[self.session > end] -= 1
         self.sessions -= 1
         self.previous[node] = before
         self._begin(node, int(self.stamps[node]))

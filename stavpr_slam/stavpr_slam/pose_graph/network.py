@@ -96,7 +96,7 @@ class Network:
         self._variables = variables
         self._covariance = self._runs.covariance[variables[self._inside]][:, at[:, None], at]
 
-    def joined(self, numbers: np.ndarray) -> int:
+    def count_joins(self, numbers: np.ndarray) -> int:
         """Return how many sessions some of the closures join to others."""
         session, pairs = self._chain.session, self._pairs[numbers]
         across = pairs[pairs[:, 0] != pairs[:, 1]]
@@ -109,9 +109,9 @@ class Network:
 
     def nodes(self, values: np.ndarray) -> np.ndarray:
         """Return the transforms of all nodes, shape (N, 4, 4)."""
-        found = np.tile(np.eye(4), (len(self._chain), 1, 1))
-        found[self._variables] = values
-        return self._runs.filled(found)
+        transforms = np.tile(np.eye(4), (len(self._chain), 1, 1))
+        transforms[self._variables] = values
+        return self._runs.fill(transforms)
 
     def odometry(self, scales: np.ndarray, closures: float = 1.0) -> np.ndarray:
         """
@@ -129,7 +129,7 @@ class Network:
 
     def residuals(self, odometry: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the squared deviations of the closures, shape (n,)."""
-        return self._solver.squared(values, odometry)[len(values) :]
+        return self._solver.linearize(values, odometry)[len(values) :]
 
     def innovations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """
@@ -151,16 +151,16 @@ class Network:
         none = np.zeros(before + len(self.query))
         return self._solver.innovations(before, none, chosen + before, spread[:, at[:, None], at])
 
-    def joining(self, taken: np.ndarray) -> np.ndarray:
+    def new_joins(self, taken: np.ndarray) -> np.ndarray:
         """Return which closures join sessions that those that are taken do not join, (n,)."""
         pairs, key = self._pairs, self._pairs @ [len(self._chain), 1]
         return (pairs[:, 0] != pairs[:, 1]) & ~np.isin(key, key[taken])
 
     def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""
-        squared = self._solver.squared(values, odometry)[: len(values)]
-        worst = int(np.argmax(squared))
-        return int(self._variables[worst]), float(squared[worst])
+        deviations = self._solver.linearize(values, odometry)[: len(values)]
+        worst = int(np.argmax(deviations))
+        return int(self._variables[worst]), float(deviations[worst])
 
     def _step(self, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the variables after a step from those of the last residuals."""
@@ -181,42 +181,22 @@ class Network:
         :raises LinAlgError: no solution.
         """
         weights, limit = np.ones(len(self.query)), self.limit
-        squared = self.residuals(odometry, values)
+        errors = self.residuals(odometry, values)
         for _ in range(0 if start else tuning.FIRST_STEPS):
             values, _ = self._step(values, weights)
-            squared = self.residuals(odometry, values)
-        if 2 * squared.max(initial=0.0) <= limit:
+            errors = self.residuals(odometry, values)
+        if 2 * errors.max(initial=0.0) <= limit:
             return weights > 0, values
-        mu = start or limit / (2 * squared.max() - limit)
+        mu = start or limit / (2 * errors.max() - limit)
         for _ in range(tuning.MAX_STEPS):
             surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
-            between = np.sqrt(limit * mu * (mu + 1) / squared.clip(surely)) - mu
-            weights = np.where(squared >= never, 0.0, np.where(squared <= surely, 1.0, between))
+            between = np.sqrt(limit * mu * (mu + 1) / errors.clip(surely)) - mu
+            weights = np.where(errors >= never, 0.0, np.where(errors <= surely, 1.0, between))
             values, _ = self._step(values, weights)
             if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
                 break
-            squared, mu = self.residuals(odometry, values), mu * tuning.GROWTH
+            errors, mu = self.residuals(odometry, values), mu * tuning.GROWTH
         return weights > 0.5, values
-
-    def solve(
-        self, odometry: np.ndarray, values: np.ndarray, weights: np.ndarray
-    ) -> tuple[np.ndarray, float, float]:
-        """
-        Estimate the variables by least squares.
-
-        :param weights: of the closures, shape (n,).
-        :returns: the variables, the squared deviations in all, and the logarithm of the
-            determinant of the square root of the information.
-        :raises LinAlgError: no solution.
-        """
-        whole = np.concatenate([np.ones(len(values)), weights])
-        error = float(self._solver.squared(values, odometry) @ whole)
-        for _ in range(tuning.MAX_STEPS):
-            values, determinant = self._step(values, weights)
-            before, error = error, float(self._solver.squared(values, odometry) @ whole)
-            if abs(before - error) < 2 * tuning.CONVERGED:
-                break
-        return values, error, determinant
 
     def fit(
         self, odometry: np.ndarray, counted: np.ndarray, values: np.ndarray
@@ -225,11 +205,17 @@ class Network:
         Estimate the variables by least squares, and return them and the evidence.
 
         :param counted: closures that count, shape (n,), bool.
+        :raises LinAlgError: no solution.
         """
-        own = np.flatnonzero(counted)
-        values, squared, determinant = self.solve(odometry, values, counted * 1.0)
         whole = np.concatenate([np.ones(len(values), bool), counted])
-        known = float(np.linalg.slogdet(odometry[whole])[1].sum()) / 2
-        evidence = known - determinant - squared / 2 + len(own) * self.room
+        error = float(self._solver.linearize(values, odometry)[whole].sum())
+        for _ in range(tuning.MAX_STEPS):
+            values, determinant = self._step(values, counted * 1.0)
+            before, error = error, float(self._solver.linearize(values, odometry)[whole].sum())
+            if abs(before - error) < 2 * tuning.CONVERGED:
+                break
+        own = np.flatnonzero(counted)
+        prior = float(np.linalg.slogdet(odometry[whole])[1].sum()) / 2
+        evidence = prior - determinant - error / 2 + len(own) * self.room
         # a session may begin anywhere in the same space
-        return values, evidence - self.joined(own) * (self.room + self._loose_determinant)
+        return values, evidence - self.count_joins(own) * (self.room + self._loose_determinant)

@@ -64,7 +64,7 @@ class Runs:
             (at - at[since]) / length, covariance,
         )  # fmt: skip
 
-    def filled(self, values: np.ndarray) -> np.ndarray:
+    def fill(self, values: np.ndarray) -> np.ndarray:
         """
         Return all nodes from the variables: the correction of a run grows with the distance.
 
@@ -77,7 +77,7 @@ class Runs:
         share, after = self.share[inner, None], self.after[inner]
         end = values[self.before[inner]] @ self.motion[after]
         turn = Rotation.from_matrix(values[after, :3, :3] @ end[:, :3, :3].swapaxes(1, 2))
-        turned = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix()
-        result[inner, :3, :3] = turned @ result[inner, :3, :3]
+        rotation = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix()
+        result[inner, :3, :3] = rotation @ result[inner, :3, :3]
         result[inner, :3, 3] += share * (values[after] - end)[:, :3, 3]
         return result

@@ -52,20 +52,20 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
     """
     T, session, Z = chain.transforms, chain.session, closures.transform
     result, links = T.copy(), {}
-    joined = weights(chain, closures).items()
-    joins = {pair for pair, weight in joined if weight >= tuning.JOINS and pair not in denied}
+    counts = weights(chain, closures).items()
+    joins = {pair for pair, weight in counts if weight >= tuning.JOINS and pair not in denied}
     pairs = session_pairs(chain, closures).tolist()
     allowed = np.array([a == b or (a, b) in joins for a, b in pairs], bool)
     starts = {int(session[node]): int(node) for node in chain.starts()}
-    waiting, known = list(starts), {KeyframeChain.FIXED}
+    waiting, placed = list(starts), {KeyframeChain.FIXED}
     while waiting:
         number = next(
-            (n for n in waiting if any(n in pair and known & {*pair} for pair in joins)),
+            (n for n in waiting if any(n in pair and placed & {*pair} for pair in joins)),
             waiting[0],
         )
-        mine, placed, node = session == number, np.isin(session, [*known]), starts[number]
-        ahead = allowed & mine[closures.query] & placed[closures.place]
-        back = allowed & mine[closures.place] & placed[closures.query]
+        mine, is_placed, node = session == number, np.isin(session, [*placed]), starts[number]
+        ahead = allowed & mine[closures.query] & is_placed[closures.place]
+        back = allowed & mine[closures.place] & is_placed[closures.query]
         others = np.concatenate([closures.place[ahead], closures.query[back]])
         if len(others):
             own = np.concatenate([closures.query[ahead], closures.place[back]])
@@ -79,7 +79,7 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
             if link >= 0:
                 result[mine] = result[link] @ inverse(T[node]) @ T[mine]
         waiting.remove(number)
-        known.add(number)
+        placed.add(number)
     return Placement(result, links, frozenset(joins), allowed)
 
 
@@ -91,23 +91,23 @@ def _best(votes: np.ndarray, transforms: np.ndarray) -> int:
     return int(np.argmin(np.quantile(away, tuning.AGREEING, axis=1)))
 
 
-def few(chain: KeyframeChain, closures: ClosureArrays, placement: Placement) -> set[Pair]:
+def weak_pairs(chain: KeyframeChain, closures: ClosureArrays, placement: Placement) -> set[Pair]:
     """Return the pairs of sessions that too few closures join, of those that are right."""
-    joined = weights(chain, closures)
-    return {pair for pair in placement.pairs if joined.get(pair, 0) < tuning.JOINS}
+    counts = weights(chain, closures)
+    return {pair for pair in placement.pairs if counts.get(pair, 0) < tuning.JOINS}
 
 
-def extended(chain: KeyframeChain, solved: np.ndarray, placement: Placement) -> np.ndarray:
+def extend(chain: KeyframeChain, solved: np.ndarray, placement: Placement) -> np.ndarray:
     """
     Return the last estimate, and for later nodes what the odometry adds to it.
 
     :param solved: the last estimate, shape (n, 4, 4).
     :returns: shape (N, 4, 4).
     """
-    T, known, initial = chain.transforms, len(solved), placement.initial
-    result = np.concatenate([solved, T[known:]])
-    later = np.arange(len(chain)) >= known
-    for session in np.unique(chain.session[known:]):
+    T, count, initial = chain.transforms, len(solved), placement.initial
+    result = np.concatenate([solved, T[count:]])
+    later = np.arange(len(chain)) >= count
+    for session in np.unique(chain.session[count:]):
         own = np.flatnonzero((chain.session == session) & later)
         first, before = int(own[0]), int(chain.previous[own[0]])
         if session == KeyframeChain.FIXED:

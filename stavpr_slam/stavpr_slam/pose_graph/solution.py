@@ -10,12 +10,12 @@ from stavpr_slam.pose_graph.decision import Decider, Decision
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.sessions import (
-    extended,
-    few,
+    extend,
     Pair,
     place,
     Placement,
     session_pairs,
+    weak_pairs,
 )
 from stavpr_slam.pose_graph.solver import squares
 
@@ -47,15 +47,15 @@ class DriveSolution(Solution):
     """
     The nodes of drives.
 
-    :param tried: robust solutions: nodes, closures that agree, and the strained node; where the
-        errors of the odometry were searched.
+    :param trials: robust solutions: nodes, closures that agree, and the node behind the bend
+        of the odometry; where its errors were searched.
     """
 
     decision: Decision
-    tried: list[tuple[np.ndarray, np.ndarray, int]]
+    trials: list[tuple[np.ndarray, np.ndarray, int]]
 
 
-def decided(
+def decide_anew(
     chain: KeyframeChain, closures: ClosureArrays, scales: np.ndarray | None = None
 ) -> DriveSolution:
     """
@@ -71,17 +71,17 @@ def decided(
         network = Network(chain, placement.initial, used, placement.links)
         decider = Decider(chain, network, placement.initial)
         if scales is None:
-            decision, tried = decider.decide(len(chain.robots))
+            decision, trials = decider.decide(len(chain.robots))
         else:
-            decision, tried = decider.at(scales), []
-        pairs = few(chain, used[decision.taken], placement)
+            decision, trials = decider.at(scales), []
+        pairs = weak_pairs(chain, used[decision.accepted], placement)
         if not pairs:
             break
         denied |= pairs
-    accepted, found, values = decision.taken, decision.scales, network.values(placement.initial)
-    counted = accepted
+    accepted = counted = decision.accepted
+    scales, values = decision.scales, network.values(placement.initial)
     if accepted.any():
-        found, values, counted = decider.estimate(decision, used.is_independent)
+        scales, values, counted = decider.estimate(decision, used.is_independent)
 
     def among_all(chosen: np.ndarray) -> np.ndarray:
         result = placement.allowed.copy()
@@ -89,12 +89,13 @@ def decided(
         return result
 
     return DriveSolution(
-        network.nodes(values), among_all(accepted), among_all(counted), found, placement, decision,
-        [(network.nodes(each.values), among_all(each.agreeing), each.strained) for each in tried],
+        network.nodes(values), among_all(accepted), among_all(counted), scales, placement,
+        decision,
+        [(network.nodes(other.values), among_all(other.inliers), other.bend) for other in trials],
     )  # fmt: skip
 
 
-def followed(
+def follow(
     chain: KeyframeChain, closures: ClosureArrays, last: DriveSolution
 ) -> DriveSolution | None:
     """
@@ -106,30 +107,27 @@ def followed(
 
     :returns: None where that is not so.
     """
-    known, placement = len(last.accepted), last.placement
+    old, placement = len(last.accepted), last.placement
     if not last.counted.any() or len(placement.links) < len(chain.starts()):
         return None
-    pairs = session_pairs(chain, closures[known:]).tolist()
+    pairs = session_pairs(chain, closures[old:]).tolist()
     if any(a != b and (a, b) not in placement.pairs for a, b in pairs):
         return None
-    nodes = extended(chain, last.nodes, placement)
-    number = np.arange(len(closures))
-    numbers = np.concatenate([np.flatnonzero(last.accepted), number[known:]])
-    used, first = closures[numbers], len(numbers) - len(closures) + known
+    nodes = extend(chain, last.nodes, placement)
+    numbers = np.flatnonzero(np.append(last.accepted, np.ones(len(closures) - old, bool)))
+    used, is_old = closures[numbers], numbers < old
     network = Network(chain, nodes, used, placement.links)
     decider = Decider(chain, network, nodes)
     information, values = decider.information(last.scales), network.values(nodes)
-    agree = (network.residuals(information, values) <= network.limit) | (
-        number[: len(used)] < first
-    )
+    agree = is_old | (network.residuals(information, values) <= network.limit)
     far = np.flatnonzero(~agree)
     if len(far):
-        before = np.append(last.counted[last.accepted], np.zeros(len(used) - first))
+        before = np.append(last.counted[last.accepted], np.zeros((~is_old).sum()))
         agree[far] = squares(network.innovations(before, far)) <= network.limit
         network.residuals(decider.information(last.decision.scales), values)
         if (squares(network.innovations(before, far)) > network.limit)[agree[far]].any():
             return None
-    own = decider.counted(agree, used.is_independent)
+    own = decider.thin(agree, used.is_independent)
     values, _ = network.fit(information, own, values)
     if (network.residuals(information, values)[far][agree[far]] > network.limit).any():
         return None
