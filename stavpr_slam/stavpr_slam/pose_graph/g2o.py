@@ -182,9 +182,9 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
         if i and i - 1 not in odometry:
             stamp, pose, spread = stamp + GAP, np.eye(4), np.zeros((6, 6))
         elif i:
-            motion, given = odometry[i - 1][2:]
+            motion, stated = odometry[i - 1][2:]
             stamp, pose = stamp + SECOND, pose @ motion
-            turn, errors = adjoints(pose[None])[0], np.linalg.inv(given)[np.ix_(ORDER, ORDER)]
+            turn, errors = adjoints(pose[None])[0], np.linalg.inv(stated)[np.ix_(ORDER, ORDER)]
             spread = spread + turn @ errors @ turn.T
         stamps.append(stamp)
         graph.add_odometry(stamp, to_poses(pose))

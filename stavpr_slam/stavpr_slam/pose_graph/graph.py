@@ -153,12 +153,12 @@ class PoseGraph:
         if query is None or place is None or query[0] == place[0]:
             return None
         (i, to_query), (j, to_place) = query, place
-        measured = matrices(closure.pose)
+        motion = matrices(closure.pose)
         # the frame of the pose moves with the query: its covariance in these axes changes by
         # the short motion between image and keyframe, which is left out
         return (
-            i, j, to_place @ measured @ inverse(to_query),
-            body_covariance(closure.covariance, measured), closure.is_independent,
+            i, j, to_place @ motion @ inverse(to_query),
+            body_covariance(closure.covariance, motion), closure.is_independent,
         )  # fmt: skip
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:

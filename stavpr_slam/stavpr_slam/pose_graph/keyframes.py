@@ -244,14 +244,15 @@ class KeyframeChain:
         :returns: stamps (m,), ns; transforms of the odometry and in the map, (m, 4, 4) each.
         """
         rows = [(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.int64))]
-        for each in self._recordings:
-            if each.robot != robot:
+        for recording in self._recordings:
+            if recording.robot != robot:
                 continue
-            stamps, poses = each.track.kept
-            nodes = np.array(each.nodes)[np.searchsorted(each.begins, stamps, 'right') - 1]
+            stamps, poses = recording.track.kept
+            numbers = np.searchsorted(recording.begins, stamps, 'right') - 1
+            nodes = np.array(recording.nodes)[numbers]
             is_solved = nodes < len(solved)
             rows.append((stamps[is_solved], matrices(poses[is_solved]), nodes[is_solved]))
-        stamps, odometry, own = (np.concatenate(each) for each in zip(*rows, strict=True))
+        stamps, odometry, own = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         return stamps, odometry, solved[own] @ inverse(self.transforms[own]) @ odometry
 
     def is_ahead(self, stamp: int, robot: str = '') -> bool:
@@ -268,7 +269,8 @@ class KeyframeChain:
             return self._cuts[node]
         number = int(self.recording[node])
         earlier = self._recordings[:number]
-        own = [each for each in earlier if each.robot == self._recordings[number].robot]
+        robot = self._recordings[number].robot
+        own = [recording for recording in earlier if recording.robot == robot]
         return own[-1].nodes[-1] if own else -1
 
     def split(self, node: int) -> None:

@@ -151,10 +151,10 @@ class Network:
         none = np.zeros(before + len(self.query))
         return self._solver.innovations(before, none, chosen + before, spread[:, at[:, None], at])
 
-    def new_joins(self, taken: np.ndarray) -> np.ndarray:
-        """Return which closures join sessions that those that are taken do not join, (n,)."""
+    def new_joins(self, accepted: np.ndarray) -> np.ndarray:
+        """Return which closures join sessions that no accepted one joins, shape (n,), bool."""
         pairs, key = self._pairs, self._pairs @ [len(self._chain), 1]
-        return (pairs[:, 0] != pairs[:, 1]) & ~np.isin(key, key[taken])
+        return (pairs[:, 0] != pairs[:, 1]) & ~np.isin(key, key[accepted])
 
     def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""

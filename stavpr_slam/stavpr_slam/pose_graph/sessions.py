@@ -86,8 +86,8 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
 def _best(votes: np.ndarray, transforms: np.ndarray) -> int:
     """Return the transform that moves points as its nearest others do."""
     points = transforms[:: max(1, len(transforms) // 20), :3, 3]
-    moved = np.einsum('nij,mj->nmi', votes[:, :3, :3], points) + votes[:, None, :3, 3]
-    away = np.linalg.norm(moved[:, None] - moved[None], axis=3).mean(axis=2)
+    votes_of_points = np.einsum('nij,mj->nmi', votes[:, :3, :3], points) + votes[:, None, :3, 3]
+    away = np.linalg.norm(votes_of_points[:, None] - votes_of_points[None], axis=3).mean(axis=2)
     return int(np.argmin(np.quantile(away, tuning.AGREEING, axis=1)))
 
 

@@ -67,21 +67,21 @@ def decide_anew(
     denied = set[Pair]()
     while True:
         placement = place(chain, closures, denied)
-        used = closures[placement.allowed]
-        network = Network(chain, placement.initial, used, placement.links)
+        usable = closures[placement.allowed]
+        network = Network(chain, placement.initial, usable, placement.links)
         decider = Decider(chain, network, placement.initial)
         if scales is None:
             decision, trials = decider.decide(len(chain.robots))
         else:
             decision, trials = decider.at(scales), []
-        pairs = weak_pairs(chain, used[decision.accepted], placement)
+        pairs = weak_pairs(chain, usable[decision.accepted], placement)
         if not pairs:
             break
         denied |= pairs
     accepted = counted = decision.accepted
     scales, values = decision.scales, network.values(placement.initial)
     if accepted.any():
-        scales, values, counted = decider.estimate(decision, used.is_independent)
+        scales, values, counted = decider.estimate(decision, usable.is_independent)
 
     def among_all(chosen: np.ndarray) -> np.ndarray:
         result = placement.allowed.copy()
@@ -115,8 +115,8 @@ def follow(
         return None
     nodes = extend(chain, last.nodes, placement)
     numbers = np.flatnonzero(np.append(last.accepted, np.ones(len(closures) - old, bool)))
-    used, is_old = closures[numbers], numbers < old
-    network = Network(chain, nodes, used, placement.links)
+    usable, is_old = closures[numbers], numbers < old
+    network = Network(chain, nodes, usable, placement.links)
     decider = Decider(chain, network, nodes)
     information, values = decider.information(last.scales), network.values(nodes)
     agree = is_old | (network.residuals(information, values) <= network.limit)
@@ -127,7 +127,7 @@ def follow(
         network.residuals(decider.information(last.decision.scales), values)
         if (squares(network.innovations(before, far)) > network.limit)[agree[far]].any():
             return None
-    own = decider.thin(agree, used.is_independent)
+    own = decider.thin(agree, usable.is_independent)
     values, _ = network.fit(information, own, values)
     if (network.residuals(information, values)[far][agree[far]] > network.limit).any():
         return None

@@ -76,12 +76,12 @@ def keyframe_edge(
     :returns: the pose of the query's keyframe in the frame of the place's, (4, 4), and its
         covariance: x y z, rotations about the fixed axes of the place's, (6, 6).
     """
-    after, measured = inverse(query), matrices(closure.pose)
+    after, motion = inverse(query), matrices(closure.pose)
     # t' = A (t + R b): an error of the rotation R also moves the end of the motion b
     jacobian = np.eye(6)
-    jacobian[:3, 3:] = -cross((measured[:3, :3] @ after[:3, 3])[None])[0]
+    jacobian[:3, 3:] = -cross((motion[:3, :3] @ after[:3, 3])[None])[0]
     jacobian = np.kron(np.eye(2), place[:3, :3]) @ jacobian
-    return place @ measured @ after, jacobian @ closure.covariance @ jacobian.T
+    return place @ motion @ after, jacobian @ closure.covariance @ jacobian.T
 
 
 def body_information(transform: np.ndarray, covariance: np.ndarray) -> np.ndarray:
