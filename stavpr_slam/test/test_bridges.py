@@ -103,8 +103,8 @@ def test_interfaces_of_missing_package_is_error_that_names_it():
 )
 def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, level, text):
     bridge = SimpleNamespace(counts=Counter(counts), resolve_topic_name='/{}'.format)
-    found, sentence = Bridge.status(bridge)
-    assert found == level
+    result, sentence = Bridge.status(bridge)
+    assert result == level
     assert text in sentence
 
 
@@ -124,7 +124,7 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
     processes = [Process(tmp_path / name, 'bridge', name) for name in targets]
     try:
         wait_until(lambda: peer.closures.get_subscription_count() == 2)
-        wait_until(lambda: all(node.count_publishers(each.topic_name) for each in subscriptions))
+        wait_until(lambda: all(node.count_publishers(own.topic_name) for own in subscriptions))
         wait_until(lambda: len(counts) == 2)  # they have discovered each other's topics
         sent = closures(Drive(), on_map=True)
         sent[-1].relative_pose.query_stamp.sec += 100  # lost in between
@@ -133,13 +133,13 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
         for message in [*sent, *closures(Drive(), on_map=False)[:3]]:
             peer.closures.publish(message)
         wait_until(
-            lambda: all(int(each.get('closures', 0)) == len(sent) + 3 for each in counts.values())
+            lambda: all(int(own.get('closures', 0)) == len(sent) + 3 for own in counts.values())
         )
         wait_until(lambda: len(priors) == EDGES and len(poses) == 2)
         assert counts['rtabmap_global_pose_bridge: bridge']['not_on_a_map'] == '3'
         assert counts['robot_localization_bridge: bridge']['invalid'] == '1'
         assert counts['robot_localization_bridge: bridge']['sent'] == '2'
-        assert [each.header.frame_id for each in (priors[0], poses[0])] == ['base_link', 'map']
+        assert (priors[0].header.frame_id, poses[0].header.frame_id) == ('base_link', 'map')
         first = poses[0].pose
         np.testing.assert_allclose(
             matrices(pose_array(first.pose)),

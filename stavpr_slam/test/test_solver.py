@@ -96,8 +96,8 @@ def test_deviations_are_by_the_errors_of_both_ends(at):
         own = J[f * len(at) : (f + 1) * len(at)]
         spread = np.linalg.inv(information[f]) + own @ poses_covariance @ own.T
         expected.append(errors[f] @ np.linalg.solve(spread, errors[f]))
-    found = squares(solver.innovations(N, weights, chosen))
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    result = squares(solver.innovations(N, weights, chosen))
+    np.testing.assert_allclose(result, expected, rtol=1e-4)
 
 
 def test_step_without_a_factor_of_the_step_before_is_that_of_a_new_solver():

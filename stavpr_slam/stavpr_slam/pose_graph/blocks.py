@@ -4,8 +4,8 @@
 Graphs of other programs: closures come in blocks by time, each decided from the last solution.
 
 The odometry goes ahead of the closures, and each closure is an event of its own. One is right if
-that is more probable than a place anywhere on the map, by the errors of the solution at both ends
-and the part of all closures that are right: certain ones first, then those that agree with them.
+that is 20 times as probable as a place anywhere on the map, by the errors of the solution at both
+ends and the part of all closures that are right; it is left out where that is no longer probable.
 The errors that the file states are right up to a factor, which the closures show.
 """
 
@@ -21,14 +21,14 @@ from stavpr_slam.pose_graph.sessions import extend, Pair, place, Placement, weak
 from stavpr_slam.pose_graph.solution import Solution
 from stavpr_slam.pose_graph.solver import likelihoods, scale_errors, squares
 
-PASSES = False, True  # over the closures of a block: again for rejected ones that agree by now
+PASSES = False, True  # over the closures of a block: again for those that agree by now
 Inliers = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
 
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
     """
-    What is known of n closures, and of the errors that the file states.
+    Evidence on n closures, and on the errors that the file states.
 
     :param space: logarithm of the poses of the map, :attr:`Network.room`.
     :param innovations: of each closure when it was compared with a solution at last, see
@@ -64,8 +64,8 @@ class Beliefs:
             right = prior * ratio / (prior * ratio + 1 - prior)
             prior = (right.sum(axis=1, keepdims=True) + 1) / (ratio.shape[1] + 2)
         evidence = np.log(prior * ratio + 1 - prior).sum(axis=1)
-        # many false ones nearby fit large errors, but without being certain
-        is_certain = evidence >= tuning.CERTAIN * right.sum(axis=1)
+        # many false ones nearby fit large errors without being certain, and one fits by chance
+        is_certain = evidence >= tuning.CERTAIN * right.sum(axis=1).clip(tuning.JOINS)
         evidence[1:] = np.where(is_certain, evidence - tuning.LOOSER, -np.inf)[1:]
         best = int(np.argmax(evidence))
         return replace(
@@ -77,7 +77,7 @@ class Beliefs:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSolution(Solution):
-    """The nodes of a graph of another program, and what is known of its closures."""
+    """The nodes of a graph of another program, and the evidence on its closures."""
 
     beliefs: Beliefs
 
@@ -100,7 +100,7 @@ def decide_in_blocks(
 
 
 class _Blocks:
-    """Adds closures in blocks; the numbers of closures and the network are of the present one."""
+    """Adds closures in blocks; ``_own`` and ``_network`` are of the present one."""
 
     def __init__(
         self, chain: KeyframeChain, closures: ClosureArrays, last: Solution, placement: Placement
@@ -169,12 +169,11 @@ class _Blocks:
         network.limit, network.room = limit, self._beliefs.space
         values, accepted = network.values(self._nodes), self._accepted[own]
         self._set_odometry()
-        residuals = network.residuals(self._odometry, values)
+        network.residuals(self._odometry, values)
         for again in PASSES:
             rows = self._beliefs.innovations[own]
             if again:
-                fits = (squares(rows) <= limit) & (self._beliefs.odds(rows) > 0)
-                new = ~accepted & ((residuals < limit) | fits)
+                new = ~accepted & (squares(rows) <= limit) & (self._beliefs.odds(rows) > 0)
             if not new.any():
                 break
             rows[new] = network.innovations(accepted, np.flatnonzero(new))
@@ -190,7 +189,6 @@ class _Blocks:
             if not passes.any():
                 continue
             inliers, values = self._drop_improbable(*self._fit(accepted | passes, values))
-            residuals = network.residuals(self._odometry, values)
             if (inliers == accepted).all():
                 break
             accepted = inliers
@@ -217,7 +215,6 @@ class _Blocks:
         while inliers.any():
             weak = np.flatnonzero(inliers)
             weak = weak[np.argsort(self._beliefs.odds(rows[self._own[weak]]))[: tuning.WEAKEST]]
-            network.residuals(self._odometry, values)
             rows[self._own[weak]] = network.innovations(inliers, weak)
             odds = self._beliefs.odds(rows[self._own[weak]])
             if odds.min() >= 0:
@@ -240,7 +237,6 @@ class _Blocks:
             if not accepted[weak] or not len(new):
                 continue
             trial_values, _ = network.fit(odometry, trial, values)
-            network.residuals(odometry, trial_values)
             rows = network.innovations(trial, new)
             fits = (squares(rows) <= network.limit) & (self._beliefs.odds(rows) > 0)
             trial |= np.isin(numbers, new[fits])

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where closures prove that the odometry missed a motion: the robot was carried."""
+"""Breaks of the odometry: closures prove that it missed a motion, as the robot was carried."""
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse

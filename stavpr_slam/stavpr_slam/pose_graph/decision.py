@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which loop closures are right, and how large the errors of the odometry are: by evidence.
+Decide which loop closures are right, and how large the errors of the odometry are: by evidence.
 
 A robust solution at a tight odometry decides over all closures, so that the result does not
 depend on their order. Its evidence is the logarithm of how much more probable the closures are
@@ -41,7 +41,7 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
 @dataclass(frozen=True, eq=False)
 class Decision:
     """
-    Which closures agree, with one factor on the errors of the odometry, and the evidence.
+    Closures that agree, with factors on the errors of the odometry, and their evidence.
 
     :param scales: factors on the errors of the odometry of each robot.
     :param inliers, values: closures of the robust solution, shape (n,), bool, and its variables.

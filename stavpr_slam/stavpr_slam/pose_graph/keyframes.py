@@ -274,7 +274,7 @@ class KeyframeChain:
         return own[-1].nodes[-1] if own else -1
 
     def split(self, node: int) -> None:
-        """Let a new session begin at a node, and its odometry in the middle of the time before."""
+        """Begin a session at a node, its odometry in the middle of the time before."""
         later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
         self.sessions += 1
@@ -283,7 +283,7 @@ class KeyframeChain:
         self._begin(node, int(self.stamps[[before, node]].mean()))
 
     def merge_session(self, node: int) -> None:
-        """Let a session that began by a split at a node be part of the one before again."""
+        """Undo the split at a node."""
         end, before = self.session[node], self._cuts.pop(node)
         self.session[self.session == end] = self.session[before]
         self.session[self.session > end] -= 1

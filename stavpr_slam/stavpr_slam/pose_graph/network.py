@@ -135,7 +135,7 @@ class Network:
         """
         Return how closures differ from what the others expect, see :meth:`Solver.innovations`.
 
-        At the variables whose residuals were asked for at last.
+        At the variables of the last residuals or fit.
 
         :param weights: of all closures in that solution.
         :param chosen: numbers of n closures.

@@ -18,7 +18,7 @@ Pair = tuple[int, int]  # numbers of sessions, the lower one first
 @dataclass(frozen=True, eq=False)
 class Placement:
     """
-    Where the sessions are in the map, before it is decided which closures are right.
+    Places of the sessions in the map, before it is decided which closures are right.
 
     :param initial: transforms of all nodes, shape (N, 4, 4): the odometry of each session, moved.
     :param links: first node of each session: the node that it is tied to; -1 = it is an anchor.
@@ -46,7 +46,7 @@ def weights(chain: KeyframeChain, closures: ClosureArrays) -> dict[Pair, int]:
 
 def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair]) -> Placement:
     """
-    Place the sessions, each where closures vote for.
+    Place the sessions where closures vote for.
 
     :param denied: pairs of sessions that do not join.
     """

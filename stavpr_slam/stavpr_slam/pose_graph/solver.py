@@ -378,7 +378,7 @@ def scale_errors(innovations: np.ndarray, factor: float) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """
-    Where the decomposition has blocks, for some of the factors.
+    Blocks of the decomposition, for some of the factors.
 
     :param order: the poses in the order of elimination, (V,).
     :param starts, rows: blocks of each column, the diagonal first, as in a CSC matrix.

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What all bridges have in common: parameters, loop closures in, counts, diagnostics."""
+"""Base of all bridges: parameters, loop closures in, counts, diagnostics."""
 
 from collections import Counter
 import importlib

@@ -85,7 +85,7 @@ class RobotLocalizationBridge(PoseBridge):
         self._last = -self._gap - 1
 
     def reason_to_skip(self, message: LoopClosure) -> str:
-        """Leave out all but the first closure after a gap."""
+        """Return why all but the first closure after a gap are left out."""
         stamp = nanoseconds(message.relative_pose.query_stamp)
         is_new = not 0 <= stamp - self._last <= self._gap
         self._last = stamp
