@@ -33,16 +33,7 @@ from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import drive_laps
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.progress import Progress
-from stavpr_slam.pose_graph import (
-    breaks,
-    Closure,
-    decision,
-    network,
-    OdometryNoise,
-    optimize,
-    PoseGraph,
-    runs,
-)
+from stavpr_slam.pose_graph import Closure, OdometryNoise, optimize, PoseGraph, tuning
 from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
 
 SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -299,15 +290,15 @@ METHODS: dict[str, Method] = {
     'Cauchy kernel': lambda drive: plain(drive, ESTIMATORS.Cauchy.Create(1.0)),
     'dynamic covariance scaling': lambda drive: plain(drive, ESTIMATORS.DCS.Create(1.0)),
     'without evidence: each correction is published': lambda drive: ours(
-        drive, decision, 'CERTAIN', -1e9
+        drive, tuning, 'CERTAIN', -1e9
     ),
-    'each closure is an event': lambda drive: ours(drive, decision, 'GAP', -1.0),
-    'a tight odometry only': lambda drive: ours(drive, decision, 'SCALES', decision.SCALES[:1]),
-    'an odometry of the default errors': lambda drive: ours(drive, decision, 'TIGHT', 1.0),
-    'without a second robust solution': lambda drive: ours(drive, decision, 'AGAIN', 1e9),
-    'without breaks': lambda drive: ours(drive, breaks, 'SUPPORT', 10**6),
-    'slower steps of the robust solution': lambda drive: ours(drive, network, 'GROWTH', 1.4),
-    'every keyframe a variable': lambda drive: ours(drive, runs, 'LONGEST', 1),
+    'each closure is an event': lambda drive: ours(drive, tuning, 'GAP', -1.0),
+    'a tight odometry only': lambda drive: ours(drive, tuning, 'SCALES', tuning.SCALES[:1]),
+    'an odometry of the default errors': lambda drive: ours(drive, tuning, 'TIGHT', 1.0),
+    'without a second robust solution': lambda drive: ours(drive, tuning, 'AGAIN', 1e9),
+    'without breaks': lambda drive: ours(drive, tuning, 'SUPPORT', 10**6),
+    'slower steps of the robust solution': lambda drive: ours(drive, tuning, 'GROWTH', 1.4),
+    'every keyframe a variable': lambda drive: ours(drive, tuning, 'LONGEST', 1),
 }  # fmt: skip
 
 

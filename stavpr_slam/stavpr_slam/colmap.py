@@ -44,8 +44,8 @@ def export(
     :returns: what was written, one line.
     :raises StavprError: a source cannot be read or does not fit, or the folder exists.
     """
-    with atomic_folder(folder) as made:
-        (made / 'images').mkdir(parents=True)
+    with atomic_folder(folder) as new:
+        (new / 'images').mkdir(parents=True)
         sizes = {}
         for place, image in _images(place_map, images, topic, camera):
             height, width = image.shape[:2]
@@ -53,7 +53,7 @@ def export(
             encoded = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[
                 1
             ]
-            (made / 'images' / _name(place)).write_bytes(encoded.tobytes())
+            (new / 'images' / _name(place)).write_bytes(encoded.tobytes())
         if not sizes:
             raise InputError(
                 'the map has no thumbnails: name the folder or bag that it is of (--images)'
@@ -62,12 +62,12 @@ def export(
             )
         pairs = sorted(p for p in _pairs(place_map, closures) if sizes.keys() >= set(p))
         text = ''.join(f'{_name(query)} {_name(place)}\n' for query, place in pairs)
-        (made / 'pairs.txt').write_text(text)
+        (new / 'pairs.txt').write_text(text)
         posed = [place for place in sizes if place_map.pose(place) is not None]
         if posed and place_map.camera is not None:
-            (made / 'sparse').mkdir()
+            (new / 'sparse').mkdir()
             for name, lines in _model(place_map, place_map.camera, posed, sizes).items():
-                (made / 'sparse' / name).write_text(''.join(f'{line}\n' for line in lines))
+                (new / 'sparse' / name).write_text(''.join(f'{line}\n' for line in lines))
             model = f'{len(posed)} poses'
         else:
             model = 'no poses: the map has no ' + ('camera' if posed else 'poses')
@@ -97,17 +97,17 @@ def _images(
         ids = {place_map.ids[place]: place for place in own.tolist()}
         stamps = {int(place_map.stamps[place]): place for place in own.tolist()}
         for frame in open_source(path, topic, fps=ALL, camera=camera):
-            known = stamps.get(frame.stamp) if frame.stamp else ids.get(frame.identifier)
-            if known is not None:
-                yield known, frame.image
+            match = stamps.get(frame.stamp) if frame.stamp else ids.get(frame.identifier)
+            if match is not None:
+                yield match, frame.image
 
 
 def _pairs(place_map: Map, closures: str) -> set[tuple[int, int]]:
     """Return pairs of places, the later one first."""
     n, index, same_as = len(place_map), place_map.session_index, place_map.same_as
     session = np.zeros(n, int) if index is None else index
-    found = [(i, j) for i in range(n) for j in range(max(0, i - NEIGHBORS), i)]
-    pairs = {(i, j) for i, j in found if session[i] == session[j]}
+    neighbors = [(i, j) for i in range(n) for j in range(max(0, i - NEIGHBORS), i)]
+    pairs = {(i, j) for i, j in neighbors if session[i] == session[j]}
     matched = [] if same_as is None else [(i, int(j)) for i, j in enumerate(same_as) if i != j]
     if closures:
         place_of = {int(stamp): i for i, stamp in enumerate(place_map.stamps) if stamp}

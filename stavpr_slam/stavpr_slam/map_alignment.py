@@ -27,7 +27,7 @@ def align(place_map: Map, reference: Map) -> Map:
         if match.accepted and len(path := match.path.pairs):
             position, place = path[len(path) // 2].tolist()
             pairs.append((i - int(path[-1, 0]) + position, place))
-    found = np.array(pairs, np.int64).reshape(-1, 2)
-    print(f'{len(found)} of {len(place_map)} places are recognized on the first map')
-    transform = align_maps(reference.poses, place_map.poses, found)
+    places = np.array(pairs, np.int64).reshape(-1, 2)
+    print(f'{len(places)} of {len(place_map)} places are recognized on the first map')
+    transform = align_maps(reference.poses, place_map.poses, places)
     return replace(place_map, poses=to_poses(transform @ matrices(place_map.poses)), map_id='')

@@ -52,7 +52,7 @@ class Drive:
 
 def closures(drive: Drive, on_map: bool) -> list[LoopClosure]:
     """Return closures with known errors; every other one is not independent, one is aligned."""
-    found = []
+    result = []
     for i, query in enumerate(range(LAP + 1, LAP + 1 + 2 * EDGES * KEYFRAME, KEYFRAME)):
         place = query - LAP + AHEAD
         message = LoopClosure(query_index=-1 if on_map else query, place_index=place)
@@ -66,9 +66,9 @@ def closures(drive: Drive, on_map: bool) -> list[LoopClosure]:
         relative.frame = 'base_link'
         relative.pose.pose = pose_message(to_poses(inverse(drive.at(place)) @ drive.at(query)))
         relative.pose.covariance = np.diag(DEVIATIONS**2).ravel()
-        found.append(message)
-    found[2].relative_pose.source = RelativePose.ALIGNED
-    return found
+        result.append(message)
+    result[2].relative_pose.source = RelativePose.ALIGNED
+    return result
 
 
 class Target(Node):
@@ -121,7 +121,7 @@ def main() -> None:
             executor.spin_once(timeout_sec=0.05)
 
     publishers = node.keyframes, node.odometry, node.closures
-    wait_until(lambda: all(each.get_subscription_count() for each in publishers))
+    wait_until(lambda: all(endpoint.get_subscription_count() for endpoint in publishers))
     while not node.received:  # the bridge may not know these publishers yet
         node.closures.publish(LoopClosure())  # has no relative pose: becomes no edge
         executor.spin_once(timeout_sec=0.2)

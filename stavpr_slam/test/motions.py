@@ -17,5 +17,5 @@ def exponentials(twists: np.ndarray) -> np.ndarray:
 
 def logarithms(motions: np.ndarray) -> np.ndarray:
     """Return the twists (n, 6) of motions (n, 4, 4)."""
-    lines = np.array([logm(each).real for each in motions])
+    lines = np.array([logm(motion).real for motion in motions])
     return lines[:, [2, 0, 1, 0, 1, 2], [1, 2, 0, 3, 3, 3]]

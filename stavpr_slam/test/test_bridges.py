@@ -40,15 +40,10 @@ def closure(pose: np.ndarray, covariance: np.ndarray = COVARIANCE) -> Closure:
 def test_keyframe_edge_of_known_motions_is_transform_of_keyframes():
     poses = matrices(np.concatenate([np.eye(4, 3), Rotation.random(4, 1).as_quat()], axis=1))
     place, query, place_keyframe, query_keyframe = poses
-    edge = keyframe_edge(
-        closure(to_poses(inverse(place) @ query)),
-        (7, inverse(place_keyframe) @ place),
-        (9, inverse(query_keyframe) @ query),
-    )
-    assert (edge.place, edge.query) == (7, 9)
-    np.testing.assert_allclose(
-        edge.transform, inverse(place_keyframe) @ query_keyframe, atol=1e-12
-    )
+    measured = closure(to_poses(inverse(place) @ query))
+    ends = inverse(place_keyframe) @ place, inverse(query_keyframe) @ query
+    transform, _ = keyframe_edge(measured, *ends)
+    np.testing.assert_allclose(transform, inverse(place_keyframe) @ query_keyframe, atol=1e-12)
 
 
 def test_keyframe_edge_covariance_is_that_of_samples():
@@ -56,15 +51,15 @@ def test_keyframe_edge_covariance_is_that_of_samples():
     start = matrices(np.array([1.0, 2, 0, 0, 0, 0.6, 0.8]))
     before = matrices(np.array([0.5, 0, 0, 0, 0.6, 0, 0.8]))
     motion = matrices(np.array([3.0, 1, 0, 0, 0, 0, 1]))  # a long one, so that its lever counts
-    edge = keyframe_edge(closure(to_poses(start)), (1, before), (2, inverse(motion)))
+    transform, covariance = keyframe_edge(closure(to_poses(start)), before, inverse(motion))
     samples = dice.multivariate_normal(np.zeros(6), COVARIANCE, 20000)
     moved = np.tile(start, (20000, 1, 1))
     moved[:, :3, :3] = Rotation.from_rotvec(samples[:, 3:]).as_matrix() @ start[:3, :3]
     moved[:, :3, 3] += samples[:, :3]
     end = before @ moved @ motion
-    turns = Rotation.from_matrix(end[:, :3, :3] @ edge.transform[:3, :3].T).as_rotvec()
-    errors = np.concatenate([end[:, :3, 3] - edge.transform[:3, 3], turns], axis=1)
-    np.testing.assert_allclose(np.cov(errors.T), edge.covariance, atol=2e-3)
+    turns = Rotation.from_matrix(end[:, :3, :3] @ transform[:3, :3].T).as_rotvec()
+    errors = np.concatenate([end[:, :3, 3] - transform[:3, 3], turns], axis=1)
+    np.testing.assert_allclose(np.cov(errors.T), covariance, atol=2e-3)
 
 
 def test_external_keyframes_near_returns_nearest_with_motion():
@@ -94,7 +89,7 @@ def test_bridge_without_target_is_usage_error(target, capsys):
 
 def test_interfaces_of_missing_package_is_error_that_names_it():
     with pytest.raises(UnavailableError, match=r'package other_msgs \(its source\): install'):
-        interfaces('other_msgs', 'its source')
+        interfaces('other_msgs', 'its source', 'msg')
 
 
 @pytest.mark.parametrize(
@@ -108,8 +103,8 @@ def test_interfaces_of_missing_package_is_error_that_names_it():
 )
 def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, level, text):
     bridge = SimpleNamespace(counts=Counter(counts), resolve_topic_name='/{}'.format)
-    found, sentence = Bridge.status(bridge)
-    assert found == level
+    result, sentence = Bridge.status(bridge)
+    assert result == level
     assert text in sentence
 
 
@@ -129,7 +124,7 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
     processes = [Process(tmp_path / name, 'bridge', name) for name in targets]
     try:
         wait_until(lambda: peer.closures.get_subscription_count() == 2)
-        wait_until(lambda: all(node.count_publishers(each.topic_name) for each in subscriptions))
+        wait_until(lambda: all(node.count_publishers(own.topic_name) for own in subscriptions))
         wait_until(lambda: len(counts) == 2)  # they have discovered each other's topics
         sent = closures(Drive(), on_map=True)
         sent[-1].relative_pose.query_stamp.sec += 100  # lost in between
@@ -138,13 +133,13 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
         for message in [*sent, *closures(Drive(), on_map=False)[:3]]:
             peer.closures.publish(message)
         wait_until(
-            lambda: all(int(each.get('closures', 0)) == len(sent) + 3 for each in counts.values())
+            lambda: all(int(own.get('closures', 0)) == len(sent) + 3 for own in counts.values())
         )
         wait_until(lambda: len(priors) == EDGES and len(poses) == 2)
         assert counts['rtabmap_global_pose_bridge: bridge']['not_on_a_map'] == '3'
         assert counts['robot_localization_bridge: bridge']['invalid'] == '1'
         assert counts['robot_localization_bridge: bridge']['sent'] == '2'
-        assert [each.header.frame_id for each in (priors[0], poses[0])] == ['base_link', 'map']
+        assert (priors[0].header.frame_id, poses[0].header.frame_id) == ('base_link', 'map')
         first = poses[0].pose
         np.testing.assert_allclose(
             matrices(pose_array(first.pose)),

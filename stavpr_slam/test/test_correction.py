@@ -29,9 +29,9 @@ def steps(target: np.ndarray, count: int, speed: float) -> tuple[np.ndarray, np.
     correction.aim(target, 0)
     before = np.eye(4)
     for i in range(1, count):
-        found = correction.at(SECOND + i * SECOND // RATE, robot(i))
-        shown.append(inverse(before @ robot(i)) @ found @ robot(i))
-        before = found
+        result = correction.at(SECOND + i * SECOND // RATE, robot(i))
+        shown.append(inverse(before @ robot(i)) @ result @ robot(i))
+        before = result
     moves = np.array(shown)
     turns = Rotation.from_matrix(moves[:, :3, :3]).magnitude()
     return np.linalg.norm(moves[:, :3, 3], axis=1), turns
@@ -56,8 +56,8 @@ def test_correction_arrives_exactly():
     correction.at(SECOND, robot(0))
     correction.aim(target, 0)
     for i in range(1, 10 * RATE):
-        found = correction.at(SECOND + i * SECOND // RATE, robot(0))
-    np.testing.assert_array_equal(found, target)
+        result = correction.at(SECOND + i * SECOND // RATE, robot(0))
+    np.testing.assert_array_equal(result, target)
 
 
 def test_correction_without_a_limit_moves_at_once():

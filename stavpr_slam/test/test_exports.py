@@ -86,8 +86,8 @@ def test_colmap_model_projects_known_points(route, capsys):
         scale, camera = width / route.camera.width, route.camera
         # the camera is .5 m ahead of the base and 1 m above it
         expected = np.array(camera.center) - np.array(camera.focal) * [1.0 / 9.5, 1.0 / 9.5]
-        found = np.array([fx * right / ahead + cx, fy * down / ahead + cy])
-        np.testing.assert_allclose(found, (expected + 0.5) * scale, rtol=1e-3)
+        result = np.array([fx * right / ahead + cx, fy * down / ahead + cy])
+        np.testing.assert_allclose(result, (expected + 0.5) * scale, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -133,8 +133,8 @@ def test_colmap_images_are_those_of_folder_and_bag(route):
     assert main(['colmap', 'route.stavpr', 'model', '--images', 'day', 'night']) == 0
     assert len(list(Path('model/images').iterdir())) == PLACES
     for place in (1, 13):
-        found = cv2.imread(f'model/images/{place:06d}.jpg').astype(int)[..., ::-1]
-        assert np.argmin([np.abs(found - image).mean() for image in images]) == place
+        result = cv2.imread(f'model/images/{place:06d}.jpg').astype(int)[..., ::-1]
+        assert np.argmin([np.abs(result - image).mean() for image in images]) == place
 
 
 @pytest.mark.parametrize(

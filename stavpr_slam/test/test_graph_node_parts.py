@@ -53,24 +53,24 @@ def test_closure_of_appearance_is_edge_of_meters_only_on_request():
     message = LoopClosure(query_index=3, place_index=1)
     message.query_stamp, message.place_stamp = time_message(3 * SECOND), time_message(SECOND)
     assert closure_of(message, appearance=False) is None
-    found = closure_of(message, appearance=True)
-    assert found is not None
-    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(3)
-    np.testing.assert_array_equal(found.pose, [0, 0, 0, 0, 0, 0, 1])
+    result = closure_of(message, appearance=True)
+    assert result is not None
+    assert np.sqrt(result.covariance[0, 0]) == pytest.approx(3)
+    np.testing.assert_array_equal(result.pose, [0, 0, 0, 0, 0, 0, 1])
     message.relative_pose.pose.pose = pose_message(np.array([9.0, 0, 0, 0, 0, 1, 0]))
     turned = closure_of(message, appearance=True)
     assert turned is not None
     np.testing.assert_array_equal(turned.pose, [0, 0, 0, 0, 0, 1, 0])  # by the mountings
-    assert not found.is_independent
+    assert not result.is_independent
 
 
 def test_closure_of_map_has_pose_of_place():
     message = LoopClosure(query_index=-1, place_index=1, map_id='abc', has_poses=True)
     message.place_pose = pose_message(planar_poses(np.array([[4.0, 5.0, 0.0]]))[0])
-    found = closure_of(message, appearance=True)
-    assert found is not None
-    assert found.map_id == 'abc'
-    np.testing.assert_allclose(found.place_pose[:2], [4, 5])
+    result = closure_of(message, appearance=True)
+    assert result is not None
+    assert result.map_id == 'abc'
+    np.testing.assert_allclose(result.place_pose[:2], [4, 5])
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_closure_of_each_source(source, has_pose, expected):
     """Appearance replaces a relative pose that could not be measured, not one refuted."""
     message = LoopClosure(query_index=9, place_index=2, has_relative_pose=has_pose)
     message.relative_pose.source = source
-    found = tuple(closure_of(message, appearance) is not None for appearance in (False, True))
-    assert found == expected
+    result = tuple(closure_of(message, appearance) is not None for appearance in (False, True))
+    assert result == expected
 
 
 def test_pose_graph_with_stamps_that_jump_back_begins_a_session():
@@ -113,9 +113,9 @@ def test_camera_transform_of_tf_is_looked_up(default_context, monkeypatch):
             asked.append((target_frame, source_frame, time.nanoseconds))
             if not self.known:
                 raise LookupError(f'{source_frame} does not exist')
-            found = TransformStamped()
-            found.transform.translation.z = 1.5
-            return found
+            result = TransformStamped()
+            result.transform.translation.z = 1.5
+            return result
 
     module = ModuleType('tf2_ros')
     module.Buffer = Buffer
@@ -131,13 +131,13 @@ def test_camera_transform_of_tf_is_looked_up(default_context, monkeypatch):
     assert camera.camera('base', 'optical') is None
     assert "no transform from 'optical' to 'base' on tf" in camera.problem
     Buffer.known = True
-    found = camera.camera('base', 'optical')
-    assert found is not None
-    assert found.mount == (0, 0, 1.5, 0, 0, 0, 1)
+    result = camera.camera('base', 'optical')
+    assert result is not None
+    assert result.mount == (0, 0, 1.5, 0, 0, 0, 1)
     assert asked == [('base', 'optical', 0)] * 2
     assert camera.yaw('', 'optical') == 0.0  # without odometry
-    found = camera.yaw('base', 'optical')
-    assert found == pytest.approx(0)  # its z is up
+    result = camera.yaw('base', 'optical')
+    assert result == pytest.approx(0)  # its z is up
     rear = CameraInput(node, '0 0 1 -1.5708 0 1.5708')
     assert abs(rear.yaw('', '')) == pytest.approx(math.pi, abs=1e-4)
     camera.close()
@@ -184,9 +184,9 @@ def errors(origin: np.ndarray, is_given: bool) -> np.ndarray:
 
 def test_server_uses_covariances_of_messages_in_the_frame_of_its_origin():
     turned = matrices(planar_poses(np.array([[5.0, 2.0, np.pi / 2]])))[0]
-    found = errors(np.eye(4), True)
-    assert found[4, 4] > 5 > 100 * found[3, 3]
-    np.testing.assert_allclose(errors(turned, True), found, atol=1e-6)
+    result = errors(np.eye(4), True)
+    assert result[4, 4] > 5 > 100 * result[3, 3]
+    np.testing.assert_allclose(errors(turned, True), result, atol=1e-6)
     assert errors(np.eye(4), False)[4, 4] < 1
 
 

@@ -99,9 +99,9 @@ def drive():
 
 def test_optimize_with_closures_corrects_drift(drive):
     truth, closures = drive
-    found, graph = solve(truth, closures)
+    estimate, graph = solve(truth, closures)
     assert error(odometry_of(truth), truth) > 3
-    assert error(found, truth) < 1
+    assert error(estimate, truth) < 1
     assert graph.accepted >= 0.95 * len(closures)
 
 
@@ -109,8 +109,8 @@ def test_burst_of_late_closures_ends_as_all_at_once(drive):
     """60 closures come together when the drive is over, the others as the robot drives."""
     truth, closures = drive
     graph = graph_of(odometry_of(truth), closures[60:], every=10)
-    for each in closures[:60]:
-        graph.add_closure(each)
+    for measurement in closures[:60]:
+        graph.add_closure(measurement)
     live = error(to_poses(graph.update()), truth)
     assert live == pytest.approx(error(solve(truth, closures)[0], truth), rel=0.05)
     online = matrices(graph.map_to_odom()) @ graph.chain.transforms[-1]
@@ -131,12 +131,11 @@ def test_optimize_with_wrong_closures_rejects_them(drive, run):
         closure(truth, LAP + k, k, (k + 30 + 9 * (k // run % 5)) % LAP) if wrong else closures[k]
         for k, wrong in enumerate(false)
     ]
-    found, graph = solve(truth, mixed)
-    clean, _ = solve(
-        truth, [each for each, wrong in zip(closures, false, strict=True) if not wrong]
-    )
+    estimate, graph = solve(truth, mixed)
+    right = [own for own, wrong in zip(closures, false, strict=True) if not wrong]
+    clean, _ = solve(truth, right)
     assert graph.rejected >= 0.9 * sum(false)
-    assert error(found, truth) < 1.3 * error(clean, truth) + 0.1
+    assert error(estimate, truth) < 1.3 * error(clean, truth) + 0.1
 
 
 def carried_drive():
@@ -162,17 +161,17 @@ def carried_drive():
 
 def test_optimize_carried_robot_cuts_where_the_odometry_stands():
     truth, odometry, closures = carried_drive()
-    found, graph = solve(truth, closures, odometry)
+    estimate, graph = solve(truth, closures, odometry)
     assert graph.splits == 1
-    assert error(found, truth) < 1.5  # one image on the wrong side would be 2 m
+    assert error(estimate, truth) < 1.5  # one image on the wrong side would be 2 m
 
 
 def test_update_carried_robot_is_found_within_80_images():
     truth, odometry, closures = carried_drive()
     graph = graph_of(odometry[:222], closures, late=10, every=4, begin=LAP + 1)
     graph.update()
-    found = np.array([graph.at((i + 1) * SECOND) for i in range(222)])
-    assert error(found, truth[:222]) < 1.5
+    estimate = np.array([graph.at((i + 1) * SECOND) for i in range(222)])
+    assert error(estimate, truth[:222]) < 1.5
 
 
 def test_optimize_odometry_reset_joins_sessions():
@@ -182,10 +181,10 @@ def test_optimize_odometry_reset_joins_sessions():
     odometry = odometry_of(truth)
     odometry[LAP:] = odometry_of(truth[LAP:])
     closures = [closure(truth, q, q - LAP, stamps=stamps) for q in range(LAP, 2 * LAP)]
-    found, graph = solve(truth, closures, odometry, stamps)
+    estimate, graph = solve(truth, closures, odometry, stamps)
     assert graph.chain.sessions == 2
     assert 'no odometry for' in graph.chain.breaks[0][1]
-    later = np.linalg.norm(found[LAP:, :2] - found[:LAP, :2], axis=1)
+    later = np.linalg.norm(estimate[LAP:, :2] - estimate[:LAP, :2], axis=1)
     assert later.max() < 1.0  # both passes of a place are at one place
 
 
@@ -197,8 +196,8 @@ def test_optimize_closures_with_map_move_graph_into_it():
         Closure((q + 1) * SECOND, 7 + q, same, NOISE, q % 5 == 0, 'map', moved[q])
         for q in range(0, LAP, 2)
     ]
-    found, _ = solve(truth, closures)
-    assert np.linalg.norm(found[:, :3] - moved[:, :3], axis=1).max() < 1.0
+    estimate, _ = solve(truth, closures)
+    assert np.linalg.norm(estimate[:, :3] - moved[:, :3], axis=1).max() < 1.0
 
 
 def test_values_that_are_invalid_are_counted(drive):
@@ -249,12 +248,12 @@ def test_update_after_extreme_values_is_finite(drive, field):
 def test_update_without_solution_leaves_new_closures_out(drive, monkeypatch):
     truth, closures = drive
     graph = graph_of(odometry_of(truth))
-    for each in closures[:20]:
-        graph.add_closure(each)
+    for measurement in closures[:20]:
+        graph.add_closure(measurement)
     graph.update()
     accepted = graph.accepted
     fails = Mock(side_effect=[np.linalg.LinAlgError, None])
-    monkeypatch.setattr(graph_module, 'followed', fails)
+    monkeypatch.setattr(graph_module, 'follow', fails)
     graph.add_closure(closures[20])
     graph.update()
     assert graph.counts['failed'] == 1
@@ -274,15 +273,15 @@ def test_update_closure_of_unknown_stamp_is_counted(drive):
 def test_add_closure_before_its_odometry_keeps_the_newest_only(drive, monkeypatch):
     monkeypatch.setattr(graph_module, 'MAX_PENDING', 3)
     graph = graph_of(odometry_of(drive[0])[:1])
-    for each in drive[1][:5]:
-        graph.add_closure(each)
+    for measurement in drive[1][:5]:
+        graph.add_closure(measurement)
     assert graph.pending == 3
 
 
 def test_optimize_images_between_keyframes_have_their_odometry():
     poses = planar_poses(np.array([[0, 0, 0], [0.2, 0, 0], [0.3, 0.1, 0], [1.5, 0, 0.0]]))
-    found, _ = optimize(SECOND * np.arange(1, 5), poses, [])
-    np.testing.assert_allclose(found[:, :3], poses[:, :3], atol=1e-9)
+    estimate, _ = optimize(SECOND * np.arange(1, 5), poses, [])
+    np.testing.assert_allclose(estimate[:, :3], poses[:, :3], atol=1e-9)
 
 
 def test_body_covariance_turned_by_90_degrees_swaps_axes():

@@ -81,7 +81,7 @@ class Peer:
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            values = {each.key: each.value for each in status.values}
+            values = {pair.key: pair.value for pair in status.values}
             self.diagnostics[status.name] = values
             if status.name == 'pose_graph: graph':
                 self.level, self.text, self.values = status.level, status.message, values
@@ -169,7 +169,7 @@ def running(peer, graph):
     """Return the node, subscribed."""
     process = graph()
     topics = peer.odometry, peer.closures
-    peer.wait_until(lambda: all(each.get_subscription_count() for each in topics))
+    peer.wait_until(lambda: all(endpoint.get_subscription_count() for endpoint in topics))
     return process
 
 
@@ -177,8 +177,8 @@ def solver_of(process: Process) -> int:
     """Return the process of the graph; 0 = there is none."""
     folder = Path(f'/proc/{process.popen.pid}/task')
     children = ' '.join(file.read_text() for file in folder.glob('*/children')).split()
-    found = [c for c in children if 'spawn_main' in Path(f'/proc/{c}/cmdline').read_text()]
-    return int(found[0]) if found else 0
+    result = [c for c in children if 'spawn_main' in Path(f'/proc/{c}/cmdline').read_text()]
+    return int(result[0]) if result else 0
 
 
 def has_ended(number: int) -> bool:
@@ -205,7 +205,7 @@ def test_pose_graph_over_ros_corrects_saves_and_survives_bad_input(peer, running
     peer.wait_until(lambda: peer.paths and len(peer.paths[-1].poses) == 2 * LAP)
     tum = np.loadtxt(tmp_path / 'drive.tum')
     assert error(tum[:, 1:], truth) < 1
-    assert len({each.header.stamp.sec for each in peer.corrected}) == 2 * LAP
+    assert len({message.header.stamp.sec for message in peer.corrected}) == 2 * LAP
     assert running.popen.poll() is None
 
 
@@ -311,7 +311,7 @@ def test_pose_graph_of_robots_has_topics_of_each(peer, graph):
     peer.node.create_subscription(Odometry, 'pose_graph/b/odometry', received.append, 10)
     publishers = [peer.node.create_publisher(Odometry, f'{name}/odom', 10) for name in 'ab']
     pose = odometry_of(circle())[0]
-    peer.wait_until(lambda: all(each.get_subscription_count() for each in publishers))
+    peer.wait_until(lambda: all(endpoint.get_subscription_count() for endpoint in publishers))
     publishers[1].publish(odometry_message(SECOND, pose))
     peer.wait_until(lambda: received)
     peer.until_diagnosed(DiagnosticStatus.WARN, 'no odometry on a/odom: remap it')
@@ -339,7 +339,7 @@ def test_pose_graph_of_two_robots_is_in_one_frame(peer, graph):
         subscribe(NavigationPath, f'{topic}/path', paths[robot].append, latched)
         publishers[robot] = peer.node.create_publisher(Odometry, f'{robot}/odom', 1000)
     topics = *publishers.values(), peer.closures
-    peer.wait_until(lambda: all(each.get_subscription_count() for each in topics))
+    peer.wait_until(lambda: all(endpoint.get_subscription_count() for endpoint in topics))
     for i in range(LAP):  # at the same time
         for robot, first in (('a', 0), ('b', LAP)):
             message = odometry_message((first + i + 1) * SECOND, odometry[robot][i])
@@ -363,7 +363,7 @@ def test_pose_graph_of_two_robots_is_in_one_frame(peer, graph):
         path = paths[robot] and paths[robot][-1].poses
         return len(path) == LAP and np.allclose(pose_array(path[-1].pose), end(robot))
 
-    peer.wait_until(lambda: all(len(each) > LAP for each in corrected.values()))
+    peer.wait_until(lambda: all(len(endpoint) > LAP for endpoint in corrected.values()))
     peer.wait_until(lambda: all(map(has_path, 'ab')))
     assert np.linalg.norm(end('a')[:3] - end('b')[:3]) < 1
 
@@ -373,5 +373,5 @@ def test_pose_graph_publishes_the_topics_of_the_layouts(peer, running):
     for name in ('pose_graph.rviz', 'pose_graph_foxglove.json'):
         topics = set(re.findall(r'(/pose_graph/\w+)', (folder / name).read_text()))
         assert topics == {f'/pose_graph/{x}' for x in ('path_before', 'path', 'edges', 'odometry')}
-        found = dict(peer.node.get_publisher_names_and_types_by_node('pose_graph', '/'))
-        assert topics <= found.keys()
+        result = dict(peer.node.get_publisher_names_and_types_by_node('pose_graph', '/'))
+        assert topics <= result.keys()

@@ -14,7 +14,7 @@ from stavpr_slam.pose_graph import (
     OdometryNoise,
     optimize,
     PoseGraph,
-    runs,
+    tuning,
 )
 from stavpr_slam.pose_graph.closures import BETWEEN_NODES
 from stavpr_slam.pose_graph.files import save_graph
@@ -52,23 +52,23 @@ def step_covariance(step: np.ndarray, noise: OdometryNoise) -> np.ndarray:
 @pytest.mark.parametrize('side', [1, -1])
 def test_path_errors_are_sums_over_the_steps(chain, side):
     ends = np.array([10, 20])[::side]
-    found = chain.path_errors(ends[:1], ends[1:])
+    result = chain.path_errors(ends[:1], ends[1:])
     T, expected = chain.transforms, np.zeros((6, 6))
     for k in range(11, 21):
         change = adjoints((inverse(T[ends[0]]) @ T[k])[None])[0]
         step = inverse(T[k - 1]) @ T[k]
         expected += change @ step_covariance(step, NOISE) @ change.T
-    assert found[0] == pytest.approx(expected, rel=1e-5, abs=1e-9)
+    assert result[0] == pytest.approx(expected, rel=1e-5, abs=1e-9)
 
 
 def test_optimize_with_runs_agrees_with_all_keyframes(monkeypatch):
     truth = circle()
     closures = [closure(truth, q, q - LAP) for q in range(LAP, 2 * LAP)]
     stamps = (np.arange(len(truth)) + 1) * SECOND
-    found, _ = optimize(stamps, odometry_of(truth), closures)
-    monkeypatch.setattr(runs, 'LONGEST', 1)
+    estimate, _ = optimize(stamps, odometry_of(truth), closures)
+    monkeypatch.setattr(tuning, 'LONGEST', 1)
     every, _ = optimize(stamps, odometry_of(truth), closures)
-    assert np.linalg.norm(found[:, :3] - every[:, :3], axis=1).max() < 0.02
+    assert np.linalg.norm(estimate[:, :3] - every[:, :3], axis=1).max() < 0.02
 
 
 def test_update_splits_runs_where_edges_arrive():
@@ -106,10 +106,10 @@ def test_update_one_false_run_proves_no_break(monkeypatch, counted):
                 graph.update()
                 splits.append(graph.splits)
     graph.update(final=True)
-    found = np.array([graph.at((i + 1) * SECOND) for i in range(len(truth))])
+    estimate = np.array([graph.at((i + 1) * SECOND) for i in range(len(truth))])
     assert any(splits) == counted
     assert graph.chain.sessions == 1
-    assert error(found, truth) < 1.5
+    assert error(estimate, truth) < 1.5
 
 
 def test_update_carried_robot_that_is_recognized_without_a_gap():
@@ -123,8 +123,8 @@ def test_update_carried_robot_that_is_recognized_without_a_gap():
         if i % 20 == 0:
             graph.update()
             splits.append(graph.splits)
-    found = to_poses(graph.update(final=True))
-    assert error(found, truth[np.arange(len(truth)) != 2 * LAP]) < 1.5
+    estimate = to_poses(graph.update(final=True))
+    assert error(estimate, truth[np.arange(len(truth)) != 2 * LAP]) < 1.5
     assert splits[-3] == 1  # within 70 images
 
 
@@ -196,11 +196,11 @@ def solved() -> tuple[PoseGraph, np.ndarray, np.ndarray, np.ndarray]:
 
 def test_at_between_keyframes_is_where_the_odometry_has_it(solved):
     graph, stamps, odometry, _ = solved
-    found = np.array([graph.at(stamp) for stamp in stamps.tolist()])
+    estimate = np.array([graph.at(stamp) for stamp in stamps.tolist()])
     exact = np.array(
         [graph.at(stamp, pose) for stamp, pose in zip(stamps.tolist(), odometry, strict=True)]
     )
-    assert np.linalg.norm(found[:, :3] - exact[:, :3], axis=1).max() < 0.06
+    assert np.linalg.norm(estimate[:, :3] - exact[:, :3], axis=1).max() < 0.06
 
 
 def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
@@ -208,11 +208,11 @@ def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
     assert save_graph(graph, str(tmp_path / 'drive.tum')) < len(stamps) / 15
     rows = np.loadtxt(tmp_path / 'drive.tum')
     seconds = stamps / SECOND
-    found = np.column_stack([np.interp(seconds, rows[:, 0], rows[:, i]) for i in (1, 2)])
+    result = np.column_stack([np.interp(seconds, rows[:, 0], rows[:, i]) for i in (1, 2)])
     exact = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
-    assert np.linalg.norm(found - np.array(exact)[:, :2], axis=1).max() < 0.1
-    assert error(found, truth) < 1
-    assert [len(each) for each in graph.chain.trajectory(graph.solved)] == 3 * [len(rows)]
+    assert np.linalg.norm(result - np.array(exact)[:, :2], axis=1).max() < 0.1
+    assert error(result, truth) < 1
+    assert [len(column) for column in graph.chain.trajectory(graph.solved)] == 3 * [len(rows)]
 
 
 def test_track_behind_its_last_kept_pose_is_up_to_the_newest():
@@ -250,8 +250,8 @@ def test_trajectory_after_a_split_belongs_to_the_session_from_its_stamp():
     chain.split(4)  # at 15 s: its keyframe has stamp 17, the one before 13
     moved = chain.transforms.copy()
     moved[4:, 1, 3] = 7.0
-    stamps, odometry, found = chain.trajectory(moved)
-    np.testing.assert_array_equal(found[:, 1, 3], np.where(stamps < 15 * SECOND, 0.0, 7.0))
-    np.testing.assert_allclose(found[:, 0, 3], odometry[:, 0, 3])
+    stamps, odometry, result = chain.trajectory(moved)
+    np.testing.assert_array_equal(result[:, 1, 3], np.where(stamps < 15 * SECOND, 0.0, 7.0))
+    np.testing.assert_allclose(result[:, 0, 3], odometry[:, 0, 3])
     for stamp in (14, 15, 16):
         assert chain.find(stamp * SECOND)[0] == (3 if stamp < 15 else 4)

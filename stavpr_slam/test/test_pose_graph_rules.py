@@ -8,16 +8,7 @@ from motions import exponentials
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import (
-    breaks,
-    Closure,
-    decision,
-    keyframes,
-    optimize,
-    PoseGraph,
-    sessions,
-    solution,
-)
+from stavpr_slam.pose_graph import Closure, keyframes, network, optimize, PoseGraph, tuning
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
 
@@ -25,8 +16,8 @@ from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry
 def ratio(truth, odometry, closures):
     """Return the error after / before, and the graph."""
     stamps = (np.arange(len(truth)) + 1) * SECOND
-    found, graph = optimize(stamps, odometry, closures)
-    return error(found, truth) / error(odometry, truth), graph
+    estimate, graph = optimize(stamps, odometry, closures)
+    return error(estimate, truth) / error(odometry, truth), graph
 
 
 def false_shifts(count: int, share: float, run: int) -> list[int]:
@@ -56,8 +47,8 @@ def slight(truth, drift):
 
 @pytest.mark.parametrize('kind', ['random', 'runs', 'shift', 'laps'])
 def test_only_false_closures_leave_the_odometry(kind):
-    found, graph = ratio(*false_drive(kind))
-    assert found < 1.02
+    relative, graph = ratio(*false_drive(kind))
+    assert relative < 1.02
     assert graph.accepted == 0
 
 
@@ -76,20 +67,20 @@ def test_false_closures_and_the_right_half_that_comes_later():
     graph = PoseGraph()
     for i, pose in enumerate(odometry):
         graph.add_odometry((i + 1) * SECOND, pose)
-    for each in closures:
-        graph.add_closure(each)
+    for measurement in closures:
+        graph.add_closure(measurement)
     graph.update()
     assert graph.accepted == 0
     for query in range(LAP, 3 * LAP):
         graph.add_closure(closure(truth, query, query - LAP))
-    found = graph.update(final=True)
+    estimate = graph.update(final=True)
     assert graph.accepted > 150
-    assert error(to_poses(found), truth) < 0.5 * error(odometry, truth)
+    assert error(to_poses(estimate), truth) < 0.5 * error(odometry, truth)
 
 
 def test_false_shift_without_evidence(monkeypatch):
     drive = false_drive('shift')
-    monkeypatch.setattr(decision, 'CERTAIN', -1e9)
+    monkeypatch.setattr(tuning, 'CERTAIN', -1e9)
     assert ratio(*drive)[0] > 2
 
 
@@ -108,10 +99,10 @@ def test_large_drift_with_a_tight_odometry_only(monkeypatch):
     truth = circle(4)
     closures = [closure(truth, q, q - LAP) for q in range(LAP, 4 * LAP, 2)]
     drive = truth, slight(truth, 2.0), closures
-    found, graph = ratio(*drive)
-    assert found < 0.15
-    assert graph.scale > decision.TIGHT
-    monkeypatch.setattr(decision, 'SCALES', decision.SCALES[:1])
+    relative, graph = ratio(*drive)
+    assert relative < 0.15
+    assert graph.scale > tuning.TIGHT
+    monkeypatch.setattr(tuning, 'SCALES', tuning.SCALES[:1])
     assert ratio(*drive)[0] > 0.3
 
 
@@ -134,9 +125,9 @@ def test_groups_of_closures_end_in_the_same_path(group):
             assert (
                 error(now, truth[: i + 1]) < 1.02 * error(odometry[: i + 1], truth[: i + 1]) + 0.2
             )
-    found = to_poses(graph.update(final=True))
+    estimate = to_poses(graph.update(final=True))
     whole, _ = optimize((np.arange(len(truth)) + 1) * SECOND, odometry, closures)
-    assert np.linalg.norm(found[:, :3] - whole[:, :3], axis=1).max() < 1e-6
+    assert np.linalg.norm(estimate[:, :3] - whole[:, :3], axis=1).max() < 1e-6
 
 
 def slipping() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -174,7 +165,7 @@ def test_covariances_of_the_odometry_correct_the_stretch_that_slips(monkeypatch)
     assert error_with(covariances) < 0.6 * without
     constant = np.tile(np.diag([0.01] * 6), (len(odometry), 1, 1))
     assert error_with(constant) == error_with(0 * constant) == without
-    monkeypatch.setattr(keyframes, 'given_growth', lambda *_: None)
+    monkeypatch.setattr(keyframes, 'message_growth', lambda *_: None)
     assert error_with(covariances) == without
 
 
@@ -184,12 +175,11 @@ def test_few_wrong_closures_join_no_session(monkeypatch):
     stamps = (np.arange(LAP) + 1) * SECOND
     stamps[50:] += 10 * SECOND
     made = [closure(truth, q, q, q - 50, stamps) for q in range(70, 76)]
-    found, _ = optimize(stamps, odometry_of(truth), made)
-    assert error(found, truth) < 2
-    for module in (sessions, solution):
-        monkeypatch.setattr(module, 'JOINS', 1)
-    found, _ = optimize(stamps, odometry_of(truth), made)
-    assert error(found, truth) > 20
+    estimate, _ = optimize(stamps, odometry_of(truth), made)
+    assert error(estimate, truth) < 2
+    monkeypatch.setattr(tuning, 'JOINS', 1)
+    estimate, _ = optimize(stamps, odometry_of(truth), made)
+    assert error(estimate, truth) > 20
 
 
 def wrong_at_the_end(count: int, laps: int = 2, size: float = 1.0):
@@ -204,9 +194,9 @@ def wrong_at_the_end(count: int, laps: int = 2, size: float = 1.0):
 
 
 def test_wrong_closures_prove_no_break():
-    found, graph = ratio(*wrong_at_the_end(28))
+    relative, graph = ratio(*wrong_at_the_end(28))
     assert graph.splits == 0
-    assert found < 1.02
+    assert relative < 1.02
 
 
 def test_few_false_runs_prove_no_break():
@@ -217,16 +207,16 @@ def test_few_false_runs_prove_no_break():
         closure(truth, query, query % LAP, (query + shift) % LAP)
         for query, shift in zip(range(LAP, 4 * LAP, 2), shifts, strict=True)
     ]
-    found, graph = ratio(truth, odometry_of(truth, drift=0.5, seed=36), closures)
+    relative, graph = ratio(truth, odometry_of(truth, drift=0.5, seed=36), closures)
     assert (graph.accepted, graph.splits) == (0, 0)
-    assert found < 1.02
+    assert relative < 1.02
 
 
 def test_carried_robot_without_breaks(monkeypatch):
     """With breaks, see test_optimize_carried_robot_cuts_where_the_odometry_stands."""
-    monkeypatch.setattr(breaks, 'SUPPORT', 10**6)
-    found, graph = ratio(*carried_drive())
-    assert (found > 0.3, graph.splits) == (True, 0)
+    monkeypatch.setattr(tuning, 'SUPPORT', 10**6)
+    relative, graph = ratio(*carried_drive())
+    assert (relative > 0.3, graph.splits) == (True, 0)
 
 
 def test_break_is_at_a_pause(monkeypatch):
@@ -236,15 +226,15 @@ def test_break_is_at_a_pause(monkeypatch):
     stamps = (np.arange(len(truth)) + 1) * SECOND
     stamps[140:] += late
     closures = [
-        replace(each, query_stamp=each.query_stamp + late * (number > 140))
-        for each in closures
-        if not 137 < (number := each.query_stamp // SECOND) <= 140
+        replace(measurement, query_stamp=measurement.query_stamp + late * (number > 140))
+        for measurement in closures
+        if not 137 < (number := measurement.query_stamp // SECOND) <= 140
     ]
-    found, _ = optimize(stamps, odometry, closures)
-    assert error(found, truth) < 1
-    monkeypatch.setattr(breaks, 'PAUSE', np.inf)
-    found, _ = optimize(stamps, odometry, closures)
-    assert error(found, truth) > 3
+    estimate, _ = optimize(stamps, odometry, closures)
+    assert error(estimate, truth) < 1
+    monkeypatch.setattr(tuning, 'PAUSE', np.inf)
+    estimate, _ = optimize(stamps, odometry, closures)
+    assert error(estimate, truth) > 3
 
 
 def test_recorded_drive_in_groups_of_ten_is_never_above_its_odometry(data_folder):
@@ -265,10 +255,10 @@ def test_recorded_drive_in_groups_of_ten_is_never_above_its_odometry(data_folder
         graph.add_closure(Closure(*stamps, np.array([0, 0, 0, 0, 0, 0, 1.0]), covariance))
         if number % 10 == 0 or number == len(pairs):
             graph.update(final=number == len(pairs))
-            found = np.array([graph.at((i + 1) * SECOND) for i in range(at)])
+            estimate = np.array([graph.at((i + 1) * SECOND) for i in range(at)])
             before = error(poses[:at], truth[:at])
-            assert error(found, truth[:at]) < max(1.02 * before, before + 0.2)
-    assert error(found, truth[:at]) < 0.75 * before
+            assert error(estimate, truth[:at]) < max(1.02 * before, before + 0.2)
+    assert error(estimate, truth[:at]) < 0.75 * before
 
 
 def test_factor_without_a_solution_is_not_tried_again(monkeypatch):
@@ -276,14 +266,14 @@ def test_factor_without_a_solution_is_not_tried_again(monkeypatch):
     truth = circle(3)
     closures = [closure(truth, query, query - LAP) for query in range(LAP, 3 * LAP, 2)]
     expected, _ = ratio(truth, slight(truth, 0.3), closures)
-    fit, scales = decision.Decider.fit, []
+    fit, scales = network.Network.fit, []
 
-    def failing(decider, information, counted, values):
+    def failing(graph, information, counted, values):
         scales.append(np.linalg.slogdet(information[1])[1])
         if scales[-1] > scales[0] + 3:  # of an odometry that is trusted more
             raise np.linalg.LinAlgError
-        return fit(decider, information, counted, values)
+        return fit(graph, information, counted, values)
 
-    monkeypatch.setattr(decision.Decider, 'fit', failing)
+    monkeypatch.setattr(network.Network, 'fit', failing)
     assert ratio(truth, slight(truth, 0.3), closures)[0] == pytest.approx(expected, rel=0.5)
     assert max(scales) > scales[0] + 3

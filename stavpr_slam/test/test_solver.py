@@ -3,11 +3,16 @@
 """Steps of the pose graph's solver, beside a dense solution whose derivatives are differences."""
 
 from motions import exponentials, logarithms
+from numba.core import event
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.solver import Solver
+from stavpr_slam.pose_graph.g2o import graph_of as graph_of_file
+from stavpr_slam.pose_graph.g2o import read_edges
+from stavpr_slam.pose_graph.solver import compile_kernels, Solver, squares
+from test_graph_files import write
+from test_pose_graph import circle, closure, LAP, solve
 
 PLANAR, SPATIAL = np.array([3, 4, 2]), np.arange(6)
 N = 12
@@ -64,7 +69,7 @@ def test_step_is_that_of_gauss_and_newton(at, turn):
     weights = np.ones(len(ends))
     weights[-2:] = 0.3, 0.0
     solver = Solver(ends, motions, at)
-    squared = solver.squared(poses, information)
+    squared = solver.linearize(poses, information)
     errors = errors_of(ends, motions, poses)[:, at]
     np.testing.assert_allclose(
         squared, np.einsum('ni,nij,nj->n', errors, information, errors), rtol=1e-6, atol=1e-9
@@ -83,7 +88,7 @@ def test_deviations_are_by_the_errors_of_both_ends(at):
     chosen, weights = np.array([N, N + 1, N + 3]), np.ones(len(ends))
     weights[chosen] = 0
     solver = Solver(ends, motions, at)
-    solver.squared(poses, information)
+    solver.linearize(poses, information)
     errors, J = errors_of(ends, motions, poses)[:, at], derivatives(ends, motions, poses, at)
     W = block_diag(*(weights[:, None, None] * information))
     poses_covariance, expected = np.linalg.inv(J.T @ W @ J), []
@@ -91,19 +96,19 @@ def test_deviations_are_by_the_errors_of_both_ends(at):
         own = J[f * len(at) : (f + 1) * len(at)]
         spread = np.linalg.inv(information[f]) + own @ poses_covariance @ own.T
         expected.append(errors[f] @ np.linalg.solve(spread, errors[f]))
-    found = solver.deviations(N, weights, chosen)
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    result = squares(solver.innovations(N, weights, chosen))
+    np.testing.assert_allclose(result, expected, rtol=1e-4)
 
 
 def test_step_without_a_factor_of_the_step_before_is_that_of_a_new_solver():
     ends, motions, information, poses = graph_of(SPATIAL, 0.1)
     solver, weights = Solver(ends, motions, SPATIAL), np.ones(len(ends))
-    solver.squared(poses, information)
+    solver.linearize(poses, information)
     solver.step(poses, weights)
     weights[-1] = 0
     again, _ = solver.step(poses, weights)
     fresh = Solver(ends, motions, SPATIAL)
-    fresh.squared(poses, information)
+    fresh.linearize(poses, information)
     np.testing.assert_allclose(again, fresh.step(poses, weights)[0], atol=1e-9)
 
 
@@ -111,6 +116,27 @@ def test_pose_without_factors_has_no_solution():
     ends, motions, information, poses = graph_of(PLANAR, 0.1)
     solver, weights = Solver(ends, motions, PLANAR), np.ones(len(ends))
     weights[(ends == N - 1).any(axis=1)] = 0.0
-    solver.squared(poses, information)
+    solver.linearize(poses, information)
     with pytest.raises(np.linalg.LinAlgError, match='no unique solution'):
         solver.step(poses, weights)
+
+
+def test_kernels_that_are_compiled_at_build_are_all_of_a_drive_and_a_file(tmp_path):
+    """The first closure of a robot compiles nothing: ``stavpr warm`` has."""
+
+    class Compiled(event.Listener):
+        def on_start(self, event):
+            names.append(event.data['dispatcher'].py_func.__name__)
+
+        def on_end(self, event):
+            """Do nothing."""
+
+    names = list[str]()
+    compile_kernels()
+    with event.install_listener('numba:compile', Compiled()):
+        truth = circle()
+        closures = [closure(truth, q, q - LAP) for q in range(LAP, 2 * LAP)]
+        solve(truth, closures)
+        for freedom in (3, 6):
+            graph_of_file(read_edges(write(tmp_path / 'a.g2o', freedom, 0.3))).update(final=True)
+    assert names == []

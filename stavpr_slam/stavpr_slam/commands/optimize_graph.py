@@ -3,13 +3,15 @@
 """``stavpr optimize_graph``: reject the false closures of a g2o file, and solve the rest."""
 
 import argparse
+import math
 import sys
 
 from stavpr_ros.commands.program import make_parser, run_program
 
 EPILOG = """Edges from a vertex to the next one are the odometry, which is right within its
-information; all others are loop closures, each right or wrong on its own. Where the odometry is
-more probable than any correction, it stays. Both dimensions: EDGE_SE2 and EDGE_SE3:QUAT.
+information times a factor, and begins anew where it is interrupted; all others are loop
+closures, each right or wrong on its own. Where the odometry is more probable than any correction,
+it stays. Both dimensions: EDGE_SE2 and EDGE_SE3:QUAT.
 
 example:
   optimize_graph manhattan.g2o --output solved.g2o
@@ -42,6 +44,10 @@ def _run(args: argparse.Namespace) -> None:
         f'{len(graph.chain)} poses, {len(graph.edges)} closures: {graph.accepted} accepted, '
         f'{graph.rejected} rejected'
     )
+    if graph.chain.sessions > 1:
+        print(f'{graph.chain.sessions} sessions: the odometry is interrupted')
+    if abs(math.log2(factor := graph.scales.max(initial=1.0))) >= 1:
+        print(f'the errors are about {factor:.2g} times as large as the file states')
     if graph.edges and not graph.accepted:
         print('the odometry stays: no closures agree with it beyond chance')
     if args.output:

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which loop closures are right, and how large the errors of the odometry are: by evidence.
+Decide which loop closures are right, and how large the errors of the odometry are: by evidence.
 
 A robust solution at a tight odometry decides over all closures, so that the result does not
 depend on their order. Its evidence is the logarithm of how much more probable the closures are
@@ -16,22 +16,10 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 
-# Chosen on KITTI 00 and 08 and a world of the demonstration; docs/slam.md has half and double.
-TIGHT = 0.125  # factor on the errors of the odometry that it is trusted by at first
-SCALES = TIGHT * 2.0 ** np.arange(6)  # those that evidence can loosen it to: up to 4
-PRECISE = TIGHT / 16  # the smallest one of a solution; for measured graphs, by evidence
-CERTAIN = math.log(20)  # evidence from which a correction is published
-LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
-DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
-AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
-MAX_TRIED = 50  # closures that are tried one by one
-KEPT = 0.9  # of the closures, by an estimate with smaller errors than a file states
-DROPPED = 20  # that deviate most and are left out one by one
-STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
-GAP = 15.0  # meters that queries and places of an event are apart at most
 FAR = 1e9  # meters between two sessions
 
 
@@ -42,13 +30,9 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
     :param query, place: nodes, (n,).
     """
     at = np.stack(
-        [chain.travelled[each] + FAR * chain.session[each] for each in (query, place)], 1
+        [chain.travelled[nodes] + FAR * chain.session[nodes] for nodes in (query, place)], 1
     )
-    near = (
-        KDTree(at).query_pairs(GAP, np.inf, output_type='ndarray')
-        if len(at)
-        else np.zeros((0, 2), int)
-    )
+    near = KDTree(at).query_pairs(tuning.GAP, np.inf, output_type='ndarray')
     graph = coo_matrix((np.ones(len(near)), near.T), (len(at),) * 2)
     numbers: np.ndarray = connected_components(graph, directed=False)[1]
     return numbers
@@ -57,22 +41,22 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
 @dataclass(frozen=True, eq=False)
 class Decision:
     """
-    Which closures agree, with one factor on the errors of the odometry, and the evidence.
+    Closures that agree, with factors on the errors of the odometry, and their evidence.
 
     :param scales: factors on the errors of the odometry of each robot.
-    :param agreeing, values: closures of the robust solution, shape (n,), bool, and its variables.
+    :param inliers, values: closures of the robust solution, shape (n,), bool, and its variables.
     :param evidence: of these closures.
     :param least: evidence from which the solution is published.
-    :param strained: node behind the part of the odometry that it bends most; -1 = none.
+    :param bend: node behind the part of the odometry that it bends most; -1 = none.
     :param chance: minus the logarithm of the probability to draw these events.
     """
 
     scales: np.ndarray
-    agreeing: np.ndarray
+    inliers: np.ndarray
     values: np.ndarray
     evidence: float
     least: float = 0.0
-    strained: int = -1
+    bend: int = -1
     chance: float = 0.0
 
     @property
@@ -81,9 +65,9 @@ class Decision:
         return self.evidence >= self.least
 
     @property
-    def taken(self) -> np.ndarray:
+    def accepted(self) -> np.ndarray:
         """Return whether each closure is right, shape (n,), bool; without evidence none is."""
-        return self.agreeing & self.is_published
+        return self.inliers & self.is_published
 
     @property
     def gain(self) -> float:
@@ -93,150 +77,85 @@ class Decision:
         Of many events, a few agree at random where the odometry explains everything: their chance
         counts against them, and so does each doubling of the errors in the settings.
         """
-        doublings = float(np.log2(self.scales.clip(1.0)).sum())
-        return max(0.0, self.evidence - self.chance - DOUBLED * doublings) * self.is_published
+        price = tuning.LOOSER * float(np.log2(self.scales.clip(1.0)).sum())
+        return max(0.0, self.evidence - self.chance - price) * self.is_published
 
 
 class Decider:
     """Decides on the closures of a network."""
 
-    def __init__(
-        self, chain: KeyframeChain, network: Network, initial: np.ndarray, measured: bool
-    ) -> None:
-        self._chain, self._network, self._measured = chain, network, measured
+    def __init__(self, chain: KeyframeChain, network: Network, initial: np.ndarray) -> None:
+        self._chain, self._network = chain, network
         self._start = network.values(initial)
-        count = len(network.query)
-        self._events = (
-            np.arange(count) if measured else events(chain, network.query, network.place)
-        )
-        size = np.maximum(np.sort(np.ptp(initial[:, :3, 3], axis=0)), 1.0)
-        space = size[1:].prod() * 2 * math.pi
-        if network.freedom == 6:
-            space = size.prod() * 8 * math.pi**2
-        self._room = math.log(space) - network.freedom / 2 * math.log(2 * math.pi)
+        self._events = events(chain, network.query, network.place)
 
     def information(self, scales: np.ndarray) -> np.ndarray:
         """Return the information of all factors at factors on the errors of each robot."""
-        closures = float(scales.min()) if self._measured else 1.0
-        return self._network.odometry(scales[self._chain.robot], closures)
+        return self._network.odometry(scales[self._chain.robot])
 
-    def representatives(self, taken: np.ndarray) -> np.ndarray:
+    def representatives(self, chosen: np.ndarray) -> np.ndarray:
         """Return the closure in the middle of each event, (m,)."""
-        numbers = np.flatnonzero(taken)
+        numbers = np.flatnonzero(chosen)
         at = self._chain.travelled[self._network.query[numbers]]
         numbers = numbers[np.lexsort((at, self._events[numbers]))]
         _, first, count = np.unique(self._events[numbers], return_index=True, return_counts=True)
-        found: np.ndarray = numbers[first + count // 2]
-        return found
+        middle: np.ndarray = numbers[first + count // 2]
+        return middle
 
-    def counted(self, taken: np.ndarray, independent: np.ndarray) -> np.ndarray:
+    def thin(self, chosen: np.ndarray, independent: np.ndarray) -> np.ndarray:
         """
         Return which of the closures that are taken count in an estimate, shape (n,), bool.
 
         :param independent: closures whose errors do not correlate, shape (n,), bool; of other
             events one closure counts.
         """
-        counted, own = taken & independent, self.representatives(taken)
-        counted[own[~np.isin(self._events[own], self._events[counted])]] = True
-        return counted
+        result, own = chosen & independent, self.representatives(chosen)
+        result[own[~np.isin(self._events[own], self._events[result])]] = True
+        return result
 
-    def fit(
-        self, information: np.ndarray, counted: np.ndarray, values: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """
-        Estimate the variables by least squares, and return them and the evidence.
-
-        :param counted: closures that count, shape (n,), bool.
-        """
-        network, own = self._network, np.flatnonzero(counted)
-        values, squared, determinant = network.solve(information, values, counted * 1.0)
-        whole = np.concatenate([np.ones(len(values), bool), counted])
-        known = float(np.linalg.slogdet(information[whole])[1].sum()) / 2
-        evidence = known - determinant - squared / 2 + len(own) * self._room
-        # a session may begin anywhere in the same space
-        return values, evidence - network.joined(own) * (self._room + network.loose_determinant)
-
-    def _evidence(self, information: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
+    def _evidence(self, information: np.ndarray, inliers: np.ndarray, values: np.ndarray) -> float:
         """Return the evidence of closures, of which one of each event counts."""
-        counted = np.zeros_like(taken)
-        counted[self.representatives(taken)] = True
-        return self.fit(information, counted, values)[1]
+        counted = np.zeros_like(inliers)
+        counted[self.representatives(inliers)] = True
+        return self._network.fit(information, counted, values)[1]
 
-    def _chance(self, taken: np.ndarray) -> float:
+    def _chance(self, inliers: np.ndarray) -> float:
         """
         Return minus the logarithm of the probability to draw the events that are taken.
 
         Events are drawn one by one, each by its number of closures, in any order: of n events of
         one size, k have 1 / binomial(n, k).
         """
-        sizes = np.sort(np.bincount(self._events[taken]))[::-1]
+        sizes = np.sort(np.bincount(self._events[inliers]))[::-1]
         sizes = sizes[sizes > 0]
-        rest = len(taken) - np.cumsum(sizes) + sizes
+        rest = len(inliers) - np.cumsum(sizes) + sizes
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
-    def _improved(
-        self, information: np.ndarray, taken: np.ndarray, values: np.ndarray, adds: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Add and leave out closures, one by one, where that is evidence.
-
-        A false closure with a large deviation agrees with many paths, and bends the odometry: it
-        is less probable than a place anywhere on the map. A right one at the end of a long path is
-        far away before others are added.
-
-        :param adds: closures in the order of the drive, unless there are many.
-        """
-        network, changed = self._network, True
-        latest = np.maximum(network.query, network.place)
-        values, evidence = self.fit(information, taken, values)
-        while changed:
-            changed, away = False, network.residuals(information, values)
-            rejected, deviating = np.flatnonzero(~taken), np.flatnonzero(taken)
-            rejected = rejected[: len(rejected) * (adds and len(rejected) <= MAX_TRIED)]
-            rejected = rejected[np.argsort(latest[rejected])]
-            deviating = deviating[np.argsort(-away[deviating])][:DROPPED]
-            for number in [*rejected, *deviating]:
-                other = taken.copy()
-                other[number] = not taken[number]
-                moved, found = self.fit(information, other, values)
-                if found > evidence:
-                    taken, values, evidence, changed = other, moved, found, True
-        return taken, values
-
-    def at(
-        self, scales: np.ndarray, thorough: bool = False, tighter: Decision | None = None
-    ) -> Decision:
+    def at(self, scales: np.ndarray) -> Decision:
         """
         Decide with an odometry.
 
         :param scales: factors on its errors, of each robot.
-        :param thorough: closures of a measured graph are added and left out one by one.
-        :param tighter: decision with a tighter odometry, at which a solution begins as well.
         """
         network = self._network
-        information = network.odometry(scales[self._chain.robot])
+        information = self.information(scales)
         none, start = np.zeros(len(network.query), bool), self._start
         try:
-            taken, values = network.robust(information, start)
-            tried, evidence = [], self._evidence(information, taken, values)
-            if taken.any():  # closures beside them may agree by now
-                tried.append(network.robust(information, values, AGAIN))
-            if tighter:
-                tried.append(network.robust(information, tighter.values, AGAIN))
-            if thorough:
-                begins = *tried, (none, start)
-                tried += [self._improved(information, *each, True) for each in begins]
-            for more, moved in tried:
-                found = self._evidence(information, more, moved)
-                if found > evidence and (self._measured or more.sum() > taken.sum()):
-                    taken, values, evidence = more, moved, found
+            inliers, values = network.robust(information, start)
+            evidence = self._evidence(information, inliers, values)
+            if inliers.any():  # closures beside them may agree by now
+                trial, trial_values = network.robust(information, values, tuning.AGAIN)
+                trial_evidence = self._evidence(information, trial, trial_values)
+                if trial_evidence > evidence and trial.sum() > inliers.sum():
+                    inliers, values, evidence = trial, trial_values, trial_evidence
         except np.linalg.LinAlgError:
             return Decision(scales, none, start, -math.inf)
-        joins = network.joined(np.flatnonzero(taken))
-        node, squared = network.most_strained(information, values)
+        joins = network.count_joins(np.flatnonzero(inliers))
+        node, deviation = network.most_strained(information, values)
+        least = tuning.CERTAIN - joins * (tuning.CERTAIN + network.limit)
         return Decision(
-            scales, taken, values, evidence, CERTAIN - joins * (CERTAIN + network.limit),
-            node if squared > STRAINED else -1, self._chance(taken),
+            scales, inliers, values, evidence, least,
+            node if deviation > tuning.STRAINED else -1, self._chance(inliers),
         )  # fmt: skip
 
     def decide(self, robots: int) -> tuple[Decision, list[Decision]]:
@@ -247,62 +166,48 @@ class Decider:
         """
 
         def better(best: Decision, other: Decision) -> Decision:
-            return other if other.gain - best.gain > LOOSENED else best
+            return other if other.gain - best.gain > tuning.LOOSER else best
 
-        best = self.at(np.full(robots, TIGHT))
-        tried = [best]
-        if self._measured:
-            best = better(best, self.at(np.full(robots, PRECISE)))
-        for scale in SCALES[1 : 4 if self._measured else None]:
-            thorough = self._measured and scale >= 1
-            tighter = tried[-1] if self._measured else None
-            tried.append(self.at(np.full(robots, scale), thorough, tighter))
-            best = better(best, tried[-1])
+        best = self.at(np.full(robots, tuning.TIGHT))
+        trials = [best]
+        for scale in tuning.SCALES[1:]:
+            trials.append(self.at(np.full(robots, scale)))
+            best = better(best, trials[-1])
             if best.is_published and all(
-                each.evidence < best.evidence - LOOSENED for each in tried[-2:]
+                trial.evidence < best.evidence - tuning.LOOSER for trial in trials[-2:]
             ):
                 break
         for robot in range(robots) if robots > 1 else ():
-            for scale in SCALES:
-                changed = np.where(np.arange(robots) == robot, scale, best.scales)
-                best = better(best, self.at(changed))
-        return best, tried
+            for scale in tuning.SCALES:
+                other = np.where(np.arange(robots) == robot, scale, best.scales)
+                best = better(best, self.at(other))
+        return best, trials
 
     def estimate(
-        self, decision: Decision, independent: np.ndarray, searches: bool
+        self, decision: Decision, independent: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
         Estimate the variables at the errors of the odometry that the closures show.
 
-        :param independent: as in :meth:`counted`.
-        :param searches: leave out closures that are less probable than a place anywhere.
+        :param independent: as in :meth:`thin`.
         :returns: the factors on the errors of each robot, the variables, and the closures that
             count, shape (n,), bool.
         """
-        if self._measured:
-            for scales in (decision.scales / TIGHT).clip(max=1.0), np.ones_like(decision.scales):
-                information = self.information(scales)
-                taken, values = self._network.robust(information, decision.values, AGAIN)
-                if taken.sum() >= KEPT * decision.taken.sum():
-                    break
-            if searches:
-                taken, values = self._improved(information, taken, values, False)
-            return scales, values, taken
-        counted = self.counted(decision.taken, independent)
+        counted = self.thin(decision.accepted, independent)
 
-        def fitted(factor: float) -> tuple[float, float, np.ndarray]:
+        def fit(factor: float) -> tuple[float, float, np.ndarray]:
             information = self.information(factor * decision.scales)
             try:
-                values, evidence = self.fit(information, counted, decision.values)
+                values, evidence = self._network.fit(information, counted, decision.values)
             except np.linalg.LinAlgError:
                 return -math.inf, factor, decision.values
             return evidence, factor, values
 
-        best, least = fitted(1.0), PRECISE / decision.scales.min()
+        best, least = fit(1.0), tuning.PRECISE / decision.scales.min()
         for change in (0.5, 2.0):
             while least <= best[1] * change < 64:
-                found = fitted(best[1] * change)
-                if found[0] <= best[0]:
+                trial = fit(best[1] * change)
+                if trial[0] <= best[0]:
                     break
-                best = found
+                best = trial
         return best[1] * decision.scales, best[2], counted

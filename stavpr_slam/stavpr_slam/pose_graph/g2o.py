@@ -7,7 +7,8 @@ The information of an edge has the translation first, and in three dimensions th
 vector of a quaternion, half of the rotation.
 """
 
-from itertools import accumulate
+from collections import Counter
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ SIZES = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}  # numbers of a pose, of i
 NORM_ERROR = 0.1  # of a quaternion in text, of a few digits
 ROUNDING = 1e-12  # of an eigenvalue, in parts of the greatest
 INFORMATION = 1e-11, 1e15  # least and greatest eigenvalue: of 3e5 and 3e-8 m
+GAP = 100 * SECOND  # between two sessions
 Edge = tuple[int, int, np.ndarray, np.ndarray]  # start, end, motion (4, 4), information (6, 6)
 
 
@@ -65,11 +67,14 @@ def read_edges(path: str) -> list[Edge]:
     """
     Read the edges of a file; those in the plane (SE2) become rigid motions.
 
+    An information matrix that is not positive definite is replaced by the nearest one that is; a
+    warning has their number.
+
     :returns: the information has the translation first, and whole rotations.
     :raises InputError: it cannot be read, has no edge, or a line is neither a vertex nor an edge
         of poses with numbers that can be computed with.
     """
-    edges = []
+    edges, counts = [], Counter[str]()
     try:
         lines = Path(path).read_text(encoding='utf-8-sig').splitlines()
     except OSError as error:
@@ -81,16 +86,21 @@ def read_edges(path: str) -> list[Edge]:
         if tag.startswith(('VERTEX_SE', 'FIX', 'PARAMS', '#')):
             continue
         try:
-            edges.append(_edge(tag, fields))
+            edges.append(_edge(tag, fields, counts))
         except (ValueError, InputError) as error:
             text = line.strip()[:60]
             raise InputError(f'{path}, line {number}: {error}, found {text!r}') from error
     if not edges:
         raise InputError(f'{path} has no edge: expected lines of {" or ".join(SIZES)}')
+    if counts['indefinite']:
+        logging.getLogger('stavpr_slam').warning(
+            '%s: %d of %d information matrices are not positive definite: the nearest ones that '
+            'are replace them', path, counts['indefinite'], len(edges),
+        )  # fmt: skip
     return edges
 
 
-def _edge(tag: str, fields: list[str]) -> Edge:
+def _edge(tag: str, fields: list[str], counts: Counter[str]) -> Edge:
     """Return the edge of a line; ValueError, InputError: none that can be computed with."""
     if tag not in SIZES:
         raise ValueError(
@@ -107,13 +117,17 @@ def _edge(tag: str, fields: list[str]) -> Edge:
     upper = np.zeros((freedom, freedom))
     upper[np.triu_indices(freedom)] = numbers[2 + pose :]
     own = upper + np.triu(upper, 1).T
-    least, *_, most = np.linalg.eigvalsh(own).tolist()
-    if least <= max(ROUNDING * most, INFORMATION[0]) or most > INFORMATION[1]:
+    values, axes = np.linalg.eigh(own)
+    most = float(values[-1])
+    if not INFORMATION[0] <= most <= INFORMATION[1]:
         raise ValueError(
-            f'the information matrix has eigenvalues of {least:.3g} to {most:.3g}: expected a '
-            'positive definite one, the inverse of a covariance, its upper triangle by rows; give '
-            'directions of which nothing is known (0) a small information, such as 1e-3'
+            f'the information matrix has eigenvalues of {values[0]:.3g} to {most:.3g}: expected '
+            'the inverse of a covariance, its upper triangle by rows'
         )
+    least = max(ROUNDING * most, INFORMATION[0])
+    if values[0] < least:
+        counts['indefinite'] += 1
+        own = (axes * values.clip(least)) @ axes.T
     if freedom == 3:
         information, at = np.eye(6) * OUT_OF_PLANE, [0, 1, 5]
         information[np.ix_(at, at)] = own
@@ -141,9 +155,10 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
 
     Edges between a vertex and the next larger number are its odometry, with their information as
     given; all others, and second ones, are closures. Those from a vertex to itself, which state
-    nothing, are left out. A node is at a second of its own.
+    nothing, are left out. A node is at a second of its own; where the odometry is interrupted, a
+    session begins.
 
-    :raises InputError: two successive vertices have no edge, or a value is not finite.
+    :raises InputError: no odometry, or a value is not finite.
     """
     edges = [edge for edge in edges if edge[0] != edge[1]]
     numbers = sorted({number for edge in edges for number in edge[:2]})
@@ -158,23 +173,24 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
             odometry[edge[0]] = edge
         else:
             closures.append(edge)
-    missing = [numbers[i] for i in range(len(numbers) - 1) if i not in odometry]
-    if missing or not odometry:
-        raise InputError(
-            f'no edge between the vertices {min(missing, default=0)} and the next one: expected '
-            'an odometry of successive vertices'
-        )
-    infinite = ChainSettings(distance=0.0, angle=0.0, max_gap=np.inf, max_speed=np.inf)
-    graph = PoseGraph(GraphSettings(infinite, measured=True))
-    _, _, motions, given = zip(*(odometry[i] for i in range(len(odometry))), strict=True)
-    poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
-    for number, pose in enumerate(to_poses(poses), 1):
-        graph.add_odometry(number * SECOND, pose)
-    turn, errors = adjoints(poses[1:]), np.linalg.inv(given)[:, ORDER][:, :, ORDER]
-    graph.chain.spread[1:] = np.cumsum(turn @ errors @ turn.swapaxes(1, 2), axis=0)
+    if not odometry:
+        raise InputError('no edge between two successive vertices: expected an odometry')
+    settings = ChainSettings(distance=0.0, angle=0.0, max_gap=GAP / SECOND / 2, max_speed=np.inf)
+    graph = PoseGraph(GraphSettings(settings, measured=True))
+    stamps, stamp, pose, spread = list[int](), SECOND, np.eye(4), np.zeros((6, 6))
+    for i in range(len(numbers)):
+        if i and i - 1 not in odometry:
+            stamp, pose, spread = stamp + GAP, np.eye(4), np.zeros((6, 6))
+        elif i:
+            motion, stated = odometry[i - 1][2:]
+            stamp, pose = stamp + SECOND, pose @ motion
+            turn, errors = adjoints(pose[None])[0], np.linalg.inv(stated)[np.ix_(ORDER, ORDER)]
+            spread = spread + turn @ errors @ turn.T
+        stamps.append(stamp)
+        graph.add_odometry(stamp, to_poses(pose))
+        graph.chain.spread[i] = spread
     for start, end, motion, information in closures:
         turn = np.kron(np.eye(2), motion[:3, :3])  # to the axes of the start
         covariance = turn @ np.linalg.inv(information) @ turn.T
-        stamps = [(i + 1) * SECOND for i in (end, start)]
-        graph.add_closure(Closure(stamps[0], stamps[1], to_poses(motion), covariance))
+        graph.add_closure(Closure(stamps[end], stamps[start], to_poses(motion), covariance))
     return graph

@@ -11,19 +11,17 @@ import numpy as np
 from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import breaks
+from stavpr_slam.pose_graph import breaks, tuning
+from stavpr_slam.pose_graph.blocks import decide_in_blocks
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
-from stavpr_slam.pose_graph.decision import events, TIGHT
+from stavpr_slam.pose_graph.decision import events
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
-from stavpr_slam.pose_graph.sessions import extended
-from stavpr_slam.pose_graph.solution import decided, followed, NOTHING, Solution
+from stavpr_slam.pose_graph.sessions import extend
+from stavpr_slam.pose_graph.solution import decide_anew, DriveSolution, follow, NOTHING, Solution
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-GROWN = 1.1  # factor on the number of closures from which scales and breaks are searched anew
-GROWN_MEASURED = 1.5  # the same of scales in measured graphs
-MAX_BREAKS = 4  # that are searched
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class PoseGraph:
         """Forget everything."""
         self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
         self._pending: list[Closure] = []
-        self._known: list[Closure] = []  # those between nodes
+        self._sources: list[Closure] = []  # those between nodes
         self._closures: ClosureArrays = between_nodes([])  # of them
         self._solution = NOTHING
         self._searched = 0  # closures of the last search
@@ -85,13 +83,15 @@ class PoseGraph:
     @property
     def scale(self) -> float:
         """Return the factor on the errors of the odometry that closures have shown, the worst."""
-        return float(self.scales.max(initial=TIGHT))
+        return float(self.scales.max(initial=tuning.TIGHT))
 
     @property
     def refused(self) -> float:
         """Return the evidence against a correction that is not published; 0 = there is none."""
-        decision = self._solution.decision
-        return 0.0 if decision.is_published else -decision.evidence
+        last = self._solution
+        if not isinstance(last, DriveSolution) or last.decision.is_published:
+            return 0.0
+        return -last.decision.evidence
 
     def add_odometry(
         self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
@@ -129,12 +129,12 @@ class PoseGraph:
 
     def _resolve(self) -> None:
         """Find the nodes of the closures that wait."""
-        waiting, found = [], []
+        waiting, rows = [], []
         for closure in self._pending:
-            resolved = self._resolved(closure)
-            if resolved is not None:
-                self._known.append(closure)
-                found.append(resolved)
+            row = self._row(closure)
+            if row is not None:
+                self._sources.append(closure)
+                rows.append(row)
                 continue
             ahead = self.chain.is_ahead
             if ahead(closure.query_stamp, closure.query_robot) or (
@@ -144,21 +144,21 @@ class PoseGraph:
             else:
                 self.counts['unknown stamp'] += 1
         self._pending = waiting
-        both = np.concatenate([self._closures, between_nodes(found)])
+        both = np.concatenate([self._closures, between_nodes(rows)])
         self._closures = both.view(np.recarray)
 
-    def _resolved(self, closure: Closure) -> tuple[Any, ...] | None:
+    def _row(self, closure: Closure) -> tuple[Any, ...] | None:
         query = self.chain.find(closure.query_stamp, closure.query_robot)
         place = self._place(closure)
         if query is None or place is None or query[0] == place[0]:
             return None
         (i, to_query), (j, to_place) = query, place
-        measured = matrices(closure.pose)
+        motion = matrices(closure.pose)
         # the frame of the pose moves with the query: its covariance in these axes changes by
         # the short motion between image and keyframe, which is left out
         return (
-            i, j, to_place @ measured @ inverse(to_query),
-            body_covariance(closure.covariance, measured), closure.is_independent,
+            i, j, to_place @ motion @ inverse(to_query),
+            body_covariance(closure.covariance, motion), closure.is_independent,
         )  # fmt: skip
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
@@ -182,42 +182,41 @@ class PoseGraph:
             return self.solved
         last = self._solution
         solved = len(last.accepted)
-        if not final and len(self._known) == solved:
-            nodes = extended(self.chain, last.nodes, last.placement.links)
+        if not final and len(self._sources) == solved:
+            nodes = extend(self.chain, last.nodes, last.placement)
             self._solution = replace(last, nodes=nodes)
             return self.solved
         try:
             self._solution = self._solve(final)
         except np.linalg.LinAlgError:
-            self.counts['failed'] += len(self._known) - solved
-            del self._known[solved:]
+            self.counts['failed'] += len(self._sources) - solved
+            del self._sources[solved:]
             self._closures = self._closures[:solved]
             self._solution = self._solve(final)
         return self.solved
 
     def _solve(self, final: bool) -> Solution:
-        last, given = self._solution, (self.chain, self._closures, self.settings.measured)
-        grown = GROWN_MEASURED if self.settings.measured else GROWN
-        if not final and len(self._known) <= grown * self._searched:
-            return followed(*given, last) or decided(*given, last.decision.scales)
+        last, graph = self._solution, (self.chain, self._closures)
+        if self.settings.measured:
+            return decide_in_blocks(*graph, NOTHING if final else last)
+        follows = not final and len(self._sources) <= tuning.SEARCH * self._searched
+        if isinstance(last, DriveSolution) and follows:
+            return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
-        found = without = self._decided()
-        for _ in range(0 if self.settings.measured else MAX_BREAKS):
-            better = self._with_break(found)
+        solution = without = decide_anew(*graph)
+        for _ in range(tuning.MAX_BREAKS):
+            better = self._with_break(solution)
             if better is None:
                 break
-            found = better
+            solution = better
         # where none is accepted without breaks, a few false runs agree with them
-        if not without.accepted.any() and found.accepted.sum() <= found.rejected:
+        if not without.accepted.any() and solution.accepted.sum() <= solution.rejected:
             for node in self.chain.splits[::-1]:
                 self._split(node, False)
-            found = without
-        self._searched = len(self._known)
-        return found
-
-    def _decided(self) -> Solution:
-        return decided(self.chain, self._closures, self.settings.measured)
+            solution = without
+        self._searched = len(self._sources)
+        return solution
 
     def _split(self, node: int, begins: bool) -> None:
         """Begin a session at a node, or end it; closures between it and the one before change."""
@@ -229,27 +228,27 @@ class PoseGraph:
             self.chain.merge_session(node)
         beside = np.isin((self._closures.query, self._closures.place), (before, node)).any(axis=0)
         for number in np.flatnonzero(beside):
-            resolved = self._resolved(self._known[number])
-            if resolved is not None:
-                self._closures[number] = resolved
+            row = self._row(self._sources[number])
+            if row is not None:
+                self._closures[number] = row
 
-    def _with_break(self, before: Solution) -> Solution | None:
+    def _with_break(self, before: DriveSolution) -> DriveSolution | None:
         """Begin a session where closures prove that the robot was carried; None = nowhere."""
         nodes = dict.fromkeys(
             node
-            for solved, agreeing, strained in before.tried
+            for solved, inliers, bend in before.trials
             for node in (
-                *breaks.find(self.chain, solved, agreeing, self._closures),
-                breaks.strained(self.chain, agreeing, self._closures.query, strained),
+                *breaks.find(self.chain, solved, inliers, self._closures),
+                breaks.find_at_bend(self.chain, inliers, self._closures.query, bend),
             )
             if node is not None
         )
-        for node in [*nodes][:MAX_BREAKS]:
+        for node in [*nodes][: tuning.MAX_BREAKS]:
             self._split(node, True)
-            after = self._decided()
+            after = decide_anew(self.chain, self._closures)
             if (
-                self._more(before, after) >= breaks.GAIN
-                or after.decision.gain - before.decision.gain > breaks.EVIDENCE
+                self._more(before, after) >= tuning.GAIN
+                or after.decision.gain - before.decision.gain > tuning.EVIDENCE
             ):
                 return after
             self._split(node, False)
@@ -276,7 +275,8 @@ class PoseGraph:
     def edges(self) -> list[GraphEdge]:
         """Return all closures between nodes."""
         ends = self._closures.query, self._closures.place, self._solution.accepted
-        return [GraphEdge(*row) for row in zip(*(each.tolist() for each in ends), strict=False)]
+        rows = zip(*(values.tolist() for values in ends), strict=False)
+        return [GraphEdge(*row) for row in rows]
 
     @property
     def accepted(self) -> int:
@@ -312,10 +312,10 @@ class PoseGraph:
         :param odometry: at the stamp, shape (7,); without it, that between keyframes is
             interpolated.
         """
-        found = self.chain.find(stamp, robot)
-        if found is None or found[0] >= len(self.solved):
+        place = self.chain.find(stamp, robot)
+        if place is None or place[0] >= len(self.solved):
             return None
-        node, motion = found
+        node, motion = place
         if odometry is not None:
             motion = inverse(self.chain.transforms[node]) @ matrices(odometry)
         return to_poses(self.solved[node] @ motion)
@@ -351,6 +351,6 @@ def optimize(
     for closure in closures:
         graph.add_closure(closure)
     graph.update(final=True)
-    found = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
+    poses = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
     missing = np.full(7, np.nan)
-    return np.array([missing if pose is None else pose for pose in found]), graph
+    return np.array([missing if pose is None else pose for pose in poses]), graph

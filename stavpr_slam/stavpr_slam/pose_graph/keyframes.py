@@ -3,6 +3,7 @@
 """Keyframes of the odometry, and the sessions between its breaks."""
 
 from bisect import bisect_right
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +11,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.units import SECOND
-from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
+from stavpr_slam.pose_graph.path_errors import LEAST, message_growth, OdometryNoise, step_errors
 from stavpr_slam.pose_graph.track import OdometryTrack
 from stavpr_slam.pose_graph.transforms import adjoints
 
@@ -88,6 +89,12 @@ class KeyframeChain:
             raise AttributeError(name)
         return self._nodes[name][: self._count]
 
+    def until(self, count: int) -> 'KeyframeChain':
+        """Return the first nodes alone, which share their arrays with these."""
+        part = copy(self)
+        part._count = count
+        return part
+
     def newest(self, robot: str = '') -> int:
         """Return the newest keyframe of a robot; -1 = none."""
         return self._current[robot].nodes[-1] if robot in self._current else -1
@@ -127,8 +134,8 @@ class KeyframeChain:
         node = current.nodes[-1]
         step = inverse(self.transforms[node]) @ matrices(pose)
         near = np.linalg.norm(step[:3, 3]) < self._settings.distance
-        turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
-        is_keyframe = bool(turned or not near)
+        turns = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
+        is_keyframe = bool(turns or not near)
         current.tail = stamp, pose
         current.track.add(stamp, pose, is_keyframe)
         if is_keyframe:
@@ -144,9 +151,9 @@ class KeyframeChain:
             return f'the stamps jumped back by {-seconds:.3f} s'
         if seconds > self._settings.max_gap:
             return f'no odometry for {seconds:.1f} s'
-        moved = float(np.linalg.norm(pose[:3] - current.tail[1][:3]))
-        if seconds >= 0 and moved > max(2.0, self._settings.max_speed * seconds):
-            return f'the odometry jumped by {moved:.1f} m'
+        length = float(np.linalg.norm(pose[:3] - current.tail[1][:3]))
+        if seconds >= 0 and length > max(2.0, self._settings.max_speed * seconds):
+            return f'the odometry jumped by {length:.1f} m'
         return ''
 
     def _append(
@@ -165,11 +172,11 @@ class KeyframeChain:
             local[:, :3, 3] -= row['origin']
             length = np.linalg.norm(local[1, :3, 3] - local[0, :3, 3])
             row['travelled'] = before['travelled'] + length
-            grown = step_errors(local, self._noise)
-            given = given_growth(current.spread, covariance, local)
-            if given is not None:
-                grown = LEAST * grown + given
-            row['spread'] = before['spread'] + grown
+            growth = step_errors(local, self._noise)
+            stated = message_growth(current.spread, covariance, local)
+            if stated is not None:
+                growth = LEAST * growth + stated
+            row['spread'] = before['spread'] + growth
         current.spread = covariance
         current.nodes.append(node)
         current.begins.append(stamp)
@@ -212,11 +219,11 @@ class KeyframeChain:
         After a split it is the keyframe after the stamp, where that is on the same side. None
         = no odometry at this stamp; the latest recording counts where stamps repeat.
         """
-        for each in reversed(self._recordings):
-            first, last = each.track.span
-            if each.robot == robot and first <= stamp <= last:
-                node = each.nodes[bisect_right(each.begins, stamp) - 1]
-                return node, inverse(self.transforms[node]) @ matrices(each.track.at(stamp))
+        for recording in reversed(self._recordings):
+            first, last = recording.track.span
+            if recording.robot == robot and first <= stamp <= last:
+                node = recording.nodes[bisect_right(recording.begins, stamp) - 1]
+                return node, inverse(self.transforms[node]) @ matrices(recording.track.at(stamp))
         return None
 
     def motion(self, start: int, end: int, robot: str = '') -> np.ndarray | None:
@@ -237,14 +244,15 @@ class KeyframeChain:
         :returns: stamps (m,), ns; transforms of the odometry and in the map, (m, 4, 4) each.
         """
         rows = [(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.int64))]
-        for each in self._recordings:
-            if each.robot != robot:
+        for recording in self._recordings:
+            if recording.robot != robot:
                 continue
-            stamps, poses = each.track.kept
-            nodes = np.array(each.nodes)[np.searchsorted(each.begins, stamps, 'right') - 1]
-            known = nodes < len(solved)
-            rows.append((stamps[known], matrices(poses[known]), nodes[known]))
-        stamps, odometry, own = (np.concatenate(each) for each in zip(*rows, strict=True))
+            stamps, poses = recording.track.kept
+            numbers = np.searchsorted(recording.begins, stamps, 'right') - 1
+            nodes = np.array(recording.nodes)[numbers]
+            is_solved = nodes < len(solved)
+            rows.append((stamps[is_solved], matrices(poses[is_solved]), nodes[is_solved]))
+        stamps, odometry, own = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         return stamps, odometry, solved[own] @ inverse(self.transforms[own]) @ odometry
 
     def is_ahead(self, stamp: int, robot: str = '') -> bool:
@@ -261,11 +269,12 @@ class KeyframeChain:
             return self._cuts[node]
         number = int(self.recording[node])
         earlier = self._recordings[:number]
-        own = [each for each in earlier if each.robot == self._recordings[number].robot]
+        robot = self._recordings[number].robot
+        own = [recording for recording in earlier if recording.robot == robot]
         return own[-1].nodes[-1] if own else -1
 
     def split(self, node: int) -> None:
-        """Let a new session begin at a node, and its odometry in the middle of the time before."""
+        """Begin a session at a node, its odometry in the middle of the time before."""
         later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
         self.sessions += 1
@@ -274,10 +283,10 @@ class KeyframeChain:
         self._begin(node, int(self.stamps[[before, node]].mean()))
 
     def merge_session(self, node: int) -> None:
-        """Let a session that began by a split at a node be part of the one before again."""
-        ended, before = self.session[node], self._cuts.pop(node)
-        self.session[self.session == ended] = self.session[before]
-        self.session[self.session > ended] -= 1
+        """Undo the split at a node."""
+        end, before = self.session[node], self._cuts.pop(node)
+        self.session[self.session == end] = self.session[before]
+        self.session[self.session > end] -= 1
         self.sessions -= 1
         self.previous[node] = before
         self._begin(node, int(self.stamps[node]))

@@ -8,24 +8,35 @@ nodes inside a run follow from its ends. Drives in a plane have poses in the pla
 """
 
 from collections.abc import Mapping
+import math
 
 import numpy as np
 from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.runs import Runs
+from stavpr_slam.pose_graph.sessions import session_pairs
 from stavpr_slam.pose_graph.solver import Solver
 
 ANCHOR = 1e-4  # deviation of the pose of the first node, rad and m
 LOOSE_ANGLE, LOOSE_POSITION = 3.0, 1e3  # of a session that nothing joins to the others
 PLANAR = [3, 4, 2]  # x, y and yaw of a twist
 FLAT = 1e-6  # m and rad out of the plane that are none
-INLIER = 0.99  # part of right closures whose residuals are below the limit
-GROWTH = 2.0  # of the parameter of graduated non-convexity
-FIRST_STEPS, MAX_STEPS = 4, 25  # of Gauss and Newton: with all closures, and at most
 NONE = 1e-4  # weight of a closure that does not count
-CONVERGED = 1e-3  # change of the error, half the squared deviations, of a solution
+
+
+def room(nodes: np.ndarray, freedom: int) -> float:
+    """
+    Return the logarithm of the poses of a map, by a normal density's constant.
+
+    :param nodes: transforms, (N, 4, 4).
+    :param freedom: of poses, 3 or 6.
+    """
+    size = np.maximum(np.sort(np.ptp(nodes[:, :3, 3], axis=0)), 1.0)
+    space = size[1:].prod() * 2 * math.pi if freedom == 3 else size.prod() * 8 * math.pi**2
+    return math.log(space) - freedom / 2 * math.log(2 * math.pi)
 
 
 class Network:
@@ -49,6 +60,7 @@ class Network:
     ) -> None:
         self._chain, self._links = chain, links
         self.query, self.place = closures.query, closures.place
+        self._pairs = session_pairs(chain, closures)
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
@@ -57,8 +69,9 @@ class Network:
         at = np.array(PLANAR if self._is_planar else range(6))
         self.freedom = len(at)
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
-        self.loose_determinant = float(np.log(loose).sum() / 2)
-        self.limit = float(chi2.ppf(INLIER, self.freedom))
+        self.room = room(initial, self.freedom)
+        self._loose_determinant = float(np.log(loose).sum() / 2)
+        self.limit = float(chi2.ppf(tuning.INLIER, self.freedom))
         self.information = np.linalg.inv(closures.covariance[:, at[:, None], at])
 
         # a factor for each variable: the odometry before it, a loose link, or an anchor
@@ -83,13 +96,12 @@ class Network:
         self._variables = variables
         self._covariance = self._runs.covariance[variables[self._inside]][:, at[:, None], at]
 
-    def joined(self, numbers: np.ndarray) -> int:
+    def count_joins(self, numbers: np.ndarray) -> int:
         """Return how many sessions some of the closures join to others."""
-        session = self._chain.session
-        ends = session[self.query[numbers]], session[self.place[numbers]]
-        across = ends[0] != ends[1]
+        session, pairs = self._chain.session, self._pairs[numbers]
+        across = pairs[pairs[:, 0] != pairs[:, 1]]
         anchored = {int(session[node]) for node, link in self._links.items() if link < 0}
-        return len({*ends[0][across].tolist(), *ends[1][across].tolist()} - anchored - {-1})
+        return len({*across.ravel().tolist()} - anchored - {-1})
 
     def values(self, nodes: np.ndarray) -> np.ndarray:
         """Return the variables of transforms of all nodes (N, 4, 4)."""
@@ -97,9 +109,9 @@ class Network:
 
     def nodes(self, values: np.ndarray) -> np.ndarray:
         """Return the transforms of all nodes, shape (N, 4, 4)."""
-        found = np.tile(np.eye(4), (len(self._chain), 1, 1))
-        found[self._variables] = values
-        return self._runs.filled(found)
+        transforms = np.tile(np.eye(4), (len(self._chain), 1, 1))
+        transforms[self._variables] = values
+        return self._runs.fill(transforms)
 
     def odometry(self, scales: np.ndarray, closures: float = 1.0) -> np.ndarray:
         """
@@ -117,24 +129,38 @@ class Network:
 
     def residuals(self, odometry: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the squared deviations of the closures, shape (n,)."""
-        return self._solver.squared(values, odometry)[len(values) :]
+        return self._solver.linearize(values, odometry)[len(values) :]
 
-    def deviations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def innovations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """
-        Return by how much closures would deviate if they counted, squared, shape (n,).
+        Return how closures differ from what the others expect, see :meth:`Solver.innovations`.
 
-        :param weights: of all closures in the solution whose residuals were asked for at last.
-        :param chosen: numbers of n closures that have no weight.
+        At the variables of the last residuals or fit.
+
+        :param weights: of all closures in that solution.
+        :param chosen: numbers of n closures.
         """
         before = len(self._variables)
         whole = np.concatenate([np.ones(before), weights])
-        return self._solver.deviations(before, whole, chosen + before)
+        return self._solver.innovations(before, whole, chosen + before)
+
+    def beside_odometry(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the same of closures within sessions beside the odometry as stated alone."""
+        before, at = len(self._variables), self._solver.at
+        spread = self._chain.path_errors(self.query[chosen], self.place[chosen])
+        none = np.zeros(before + len(self.query))
+        return self._solver.innovations(before, none, chosen + before, spread[:, at[:, None], at])
+
+    def new_joins(self, accepted: np.ndarray) -> np.ndarray:
+        """Return which closures join sessions that no accepted one joins, shape (n,), bool."""
+        pairs, key = self._pairs, self._pairs @ [len(self._chain), 1]
+        return (pairs[:, 0] != pairs[:, 1]) & ~np.isin(key, key[accepted])
 
     def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""
-        squared = self._solver.squared(values, odometry)[: len(values)]
-        worst = int(np.argmax(squared))
-        return int(self._variables[worst]), float(squared[worst])
+        deviations = self._solver.linearize(values, odometry)[: len(values)]
+        worst = int(np.argmax(deviations))
+        return int(self._variables[worst]), float(deviations[worst])
 
     def _step(self, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the variables after a step from those of the last residuals."""
@@ -155,39 +181,41 @@ class Network:
         :raises LinAlgError: no solution.
         """
         weights, limit = np.ones(len(self.query)), self.limit
-        squared = self.residuals(odometry, values)
-        for _ in range(0 if start else FIRST_STEPS):
+        errors = self.residuals(odometry, values)
+        for _ in range(0 if start else tuning.FIRST_STEPS):
             values, _ = self._step(values, weights)
-            squared = self.residuals(odometry, values)
-        if 2 * squared.max(initial=0.0) <= limit:
+            errors = self.residuals(odometry, values)
+        if 2 * errors.max(initial=0.0) <= limit:
             return weights > 0, values
-        mu = start or limit / (2 * squared.max() - limit)
-        for _ in range(MAX_STEPS):
+        mu = start or limit / (2 * errors.max() - limit)
+        for _ in range(tuning.MAX_STEPS):
             surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
-            between = np.sqrt(limit * mu * (mu + 1) / squared.clip(surely)) - mu
-            weights = np.where(squared >= never, 0.0, np.where(squared <= surely, 1.0, between))
+            between = np.sqrt(limit * mu * (mu + 1) / errors.clip(surely)) - mu
+            weights = np.where(errors >= never, 0.0, np.where(errors <= surely, 1.0, between))
             values, _ = self._step(values, weights)
             if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
                 break
-            squared, mu = self.residuals(odometry, values), mu * GROWTH
+            errors, mu = self.residuals(odometry, values), mu * tuning.GROWTH
         return weights > 0.5, values
 
-    def solve(
-        self, odometry: np.ndarray, values: np.ndarray, weights: np.ndarray
-    ) -> tuple[np.ndarray, float, float]:
+    def fit(
+        self, odometry: np.ndarray, counted: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """
-        Estimate the variables by least squares.
+        Estimate the variables by least squares, and return them and the evidence.
 
-        :param weights: of the closures, shape (n,).
-        :returns: the variables, the squared deviations in all, and the logarithm of the
-            determinant of the square root of the information.
+        :param counted: closures that count, shape (n,), bool.
         :raises LinAlgError: no solution.
         """
-        whole = np.concatenate([np.ones(len(values)), weights])
-        error = float(self._solver.squared(values, odometry) @ whole)
-        for _ in range(MAX_STEPS):
-            values, determinant = self._step(values, weights)
-            before, error = error, float(self._solver.squared(values, odometry) @ whole)
-            if abs(before - error) < 2 * CONVERGED:
+        whole = np.concatenate([np.ones(len(values), bool), counted])
+        error = float(self._solver.linearize(values, odometry)[whole].sum())
+        for _ in range(tuning.MAX_STEPS):
+            values, determinant = self._step(values, counted * 1.0)
+            before, error = error, float(self._solver.linearize(values, odometry)[whole].sum())
+            if abs(before - error) < 2 * tuning.CONVERGED:
                 break
-        return values, error, determinant
+        own = np.flatnonzero(counted)
+        prior = float(np.linalg.slogdet(odometry[whole])[1].sum()) / 2
+        evidence = prior - determinant - error / 2 + len(own) * self.room
+        # a session may begin anywhere in the same space
+        return values, evidence - self.count_joins(own) * (self.room + self._loose_determinant)

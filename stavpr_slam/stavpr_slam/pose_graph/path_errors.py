@@ -47,7 +47,7 @@ def step_errors(ends: np.ndarray, noise: OdometryNoise) -> np.ndarray:
     return max(length, SHORTEST) * spread
 
 
-def given_growth(
+def message_growth(
     before: np.ndarray | None, after: np.ndarray | None, ends: np.ndarray
 ) -> np.ndarray | None:
     """
@@ -66,6 +66,6 @@ def given_growth(
         change[:3, 3:] = change[3:, :3] = np.eye(3)
         change[3:, 3:] = cross(pose[None, :3, 3])[0]
         sums.append(change @ covariance @ change.T)
-    grown: np.ndarray = sums[1] - sums[0]
-    values = np.linalg.eigvalsh((grown + grown.T) / 2)
-    return grown if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None
+    growth: np.ndarray = sums[1] - sums[0]
+    values = np.linalg.eigvalsh((growth + growth.T) / 2)
+    return growth if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None

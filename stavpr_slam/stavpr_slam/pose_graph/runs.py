@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-
-LONGEST = 10  # keyframes of a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,7 @@ class Runs:
         begins = (chain.previous < 0)[order]
         number = np.arange(count)
         start = np.maximum.accumulate(np.where(begins, number, 0))
-        chosen = begins | ((number - start) % LONGEST == 0)
+        chosen = begins | ((number - start) % tuning.LONGEST == 0)
         chosen[np.isin(order, list(ends))] = True
         own = np.maximum.accumulate(np.where(chosen, number, 0))  # variable at or before
         first = np.where(chosen & ~begins, own[number - 1], own)  # and before a variable
@@ -65,7 +64,7 @@ class Runs:
             (at - at[since]) / length, covariance,
         )  # fmt: skip
 
-    def filled(self, values: np.ndarray) -> np.ndarray:
+    def fill(self, values: np.ndarray) -> np.ndarray:
         """
         Return all nodes from the variables: the correction of a run grows with the distance.
 
@@ -78,7 +77,7 @@ class Runs:
         share, after = self.share[inner, None], self.after[inner]
         end = values[self.before[inner]] @ self.motion[after]
         turn = Rotation.from_matrix(values[after, :3, :3] @ end[:, :3, :3].swapaxes(1, 2))
-        turned = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix()
-        result[inner, :3, :3] = turned @ result[inner, :3, :3]
+        rotation = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix()
+        result[inner, :3, :3] = rotation @ result[inner, :3, :3]
         result[inner, :3, 3] += share * (values[after] - end)[:, :3, 3]
         return result

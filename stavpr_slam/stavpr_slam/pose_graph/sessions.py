@@ -8,19 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
-JOINS = 8  # closures that join two sessions
-AGREEING = 0.25  # part of the closures between sessions that agree at least
-SAMPLE = 100  # closures between sessions that vote, and poses that they move, at most
 Pair = tuple[int, int]  # numbers of sessions, the lower one first
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
     """
-    Where the sessions are in the map, before it is decided which closures are right.
+    Places of the sessions in the map, before it is decided which closures are right.
 
     :param initial: transforms of all nodes, shape (N, 4, 4): the odometry of each session, moved.
     :param links: first node of each session: the node that it is tied to; -1 = it is an anchor.
@@ -48,30 +46,30 @@ def weights(chain: KeyframeChain, closures: ClosureArrays) -> dict[Pair, int]:
 
 def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair]) -> Placement:
     """
-    Place the sessions, each where closures vote for.
+    Place the sessions where closures vote for.
 
     :param denied: pairs of sessions that do not join.
     """
     T, session, Z = chain.transforms, chain.session, closures.transform
     result, links = T.copy(), {}
-    joined = weights(chain, closures).items()
-    joins = {pair for pair, weight in joined if weight >= JOINS and pair not in denied}
+    counts = weights(chain, closures).items()
+    joins = {pair for pair, weight in counts if weight >= tuning.JOINS and pair not in denied}
     pairs = session_pairs(chain, closures).tolist()
     allowed = np.array([a == b or (a, b) in joins for a, b in pairs], bool)
     starts = {int(session[node]): int(node) for node in chain.starts()}
-    waiting, known = list(starts), {KeyframeChain.FIXED}
+    waiting, placed = list(starts), {KeyframeChain.FIXED}
     while waiting:
         number = next(
-            (n for n in waiting if any(n in pair and known & {*pair} for pair in joins)),
+            (n for n in waiting if any(n in pair and placed & {*pair} for pair in joins)),
             waiting[0],
         )
-        mine, placed, node = session == number, np.isin(session, [*known]), starts[number]
-        ahead = allowed & mine[closures.query] & placed[closures.place]
-        back = allowed & mine[closures.place] & placed[closures.query]
+        mine, is_placed, node = session == number, np.isin(session, [*placed]), starts[number]
+        ahead = allowed & mine[closures.query] & is_placed[closures.place]
+        back = allowed & mine[closures.place] & is_placed[closures.query]
         others = np.concatenate([closures.place[ahead], closures.query[back]])
         if len(others):
             own = np.concatenate([closures.query[ahead], closures.place[back]])
-            thin = np.linspace(0, len(own) - 1, min(SAMPLE, len(own))).astype(int)
+            thin = np.linspace(0, len(own) - 1, min(tuning.SAMPLE, len(own))).astype(int)
             motions = np.concatenate([Z[ahead], inverse(Z[back])])[thin]
             votes = result[others[thin]] @ motions @ inverse(T[own[thin]])
             best = _best(votes, T[mine])
@@ -81,35 +79,43 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
             if link >= 0:
                 result[mine] = result[link] @ inverse(T[node]) @ T[mine]
         waiting.remove(number)
-        known.add(number)
+        placed.add(number)
     return Placement(result, links, frozenset(joins), allowed)
 
 
 def _best(votes: np.ndarray, transforms: np.ndarray) -> int:
     """Return the transform that moves points as its nearest others do."""
     points = transforms[:: max(1, len(transforms) // 20), :3, 3]
-    moved = np.einsum('nij,mj->nmi', votes[:, :3, :3], points) + votes[:, None, :3, 3]
-    away = np.linalg.norm(moved[:, None] - moved[None], axis=3).mean(axis=2)
-    return int(np.argmin(np.quantile(away, AGREEING, axis=1)))
+    votes_of_points = np.einsum('nij,mj->nmi', votes[:, :3, :3], points) + votes[:, None, :3, 3]
+    away = np.linalg.norm(votes_of_points[:, None] - votes_of_points[None], axis=3).mean(axis=2)
+    return int(np.argmin(np.quantile(away, tuning.AGREEING, axis=1)))
 
 
-def extended(chain: KeyframeChain, solved: np.ndarray, links: dict[int, int]) -> np.ndarray:
+def weak_pairs(chain: KeyframeChain, closures: ClosureArrays, placement: Placement) -> set[Pair]:
+    """Return the pairs of sessions that too few closures join, of those that are right."""
+    counts = weights(chain, closures)
+    return {pair for pair in placement.pairs if counts.get(pair, 0) < tuning.JOINS}
+
+
+def extend(chain: KeyframeChain, solved: np.ndarray, placement: Placement) -> np.ndarray:
     """
     Return the last estimate, and for later nodes what the odometry adds to it.
 
     :param solved: the last estimate, shape (n, 4, 4).
-    :param links: as in :class:`Placement`.
     :returns: shape (N, 4, 4).
     """
-    T, known = chain.transforms, len(solved)
-    result = np.concatenate([solved, T[known:]])
-    later = np.arange(len(chain)) >= known
-    for session in set(chain.session[known:].tolist()) - {KeyframeChain.FIXED}:
+    T, count, initial = chain.transforms, len(solved), placement.initial
+    result = np.concatenate([solved, T[count:]])
+    later = np.arange(len(chain)) >= count
+    for session in np.unique(chain.session[count:]):
         own = np.flatnonzero((chain.session == session) & later)
-        first, before = own[0], int(chain.previous[own[0]])
-        moved = T[before] if before >= 0 else T[first]
-        if before < 0:
-            before = links.get(int(first), chain.before(int(first)))
+        first, before = int(own[0]), int(chain.previous[own[0]])
+        if session == KeyframeChain.FIXED:
+            continue
         if before >= 0:
-            result[own] = result[before] @ inverse(moved) @ T[own]
+            result[own] = result[before] @ inverse(T[before]) @ T[own]
+        elif 0 <= (link := placement.links.get(first, -1)) < first:
+            result[own] = result[link] @ inverse(initial[link]) @ initial[own]
+        elif (before := chain.before(first)) >= 0:
+            result[own] = result[before] @ inverse(T[first]) @ T[own]
     return result

@@ -10,14 +10,14 @@ from stavpr_slam.pose_graph.decision import Decider, Decision
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.sessions import (
-    extended,
-    JOINS,
+    extend,
     Pair,
     place,
     Placement,
     session_pairs,
-    weights,
+    weak_pairs,
 )
+from stavpr_slam.pose_graph.solver import squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,6 @@ class Solution:
     :param nodes: transforms in the map, (N, 4, 4).
     :param accepted, counted: of n closures, which are right, and which count in the solution.
     :param scales: factors on the errors of the odometry of each robot.
-    :param tried: robust solutions: nodes, closures that agree, and the strained node; where the
-        errors of the odometry were searched.
     """
 
     nodes: np.ndarray
@@ -37,8 +35,6 @@ class Solution:
     counted: np.ndarray
     scales: np.ndarray
     placement: Placement
-    decision: Decision
-    tried: list[tuple[np.ndarray, np.ndarray, int]]
 
     @property
     def rejected(self) -> int:
@@ -46,52 +42,62 @@ class Solution:
         return int((~self.accepted).sum())
 
 
-def decided(
-    chain: KeyframeChain, closures: ClosureArrays, measured: bool, scales: np.ndarray | None = None
-) -> Solution:
+@dataclass(frozen=True, eq=False)
+class DriveSolution(Solution):
+    """
+    The nodes of drives.
+
+    :param trials: robust solutions: nodes, closures that agree, and the node behind the bend
+        of the odometry; where its errors were searched.
+    """
+
+    decision: Decision
+    trials: list[tuple[np.ndarray, np.ndarray, int]]
+
+
+def decide_anew(
+    chain: KeyframeChain, closures: ClosureArrays, scales: np.ndarray | None = None
+) -> DriveSolution:
     """
     Decide on all closures anew, and estimate all nodes.
 
-    :param measured: as in :class:`GraphSettings`.
     :param scales: factors on the errors of the odometry of each robot, as decided before; None =
         they are searched.
     """
     denied = set[Pair]()
     while True:
         placement = place(chain, closures, denied)
-        used = closures[placement.allowed]
-        network = Network(chain, placement.initial, used, placement.links)
-        decider = Decider(chain, network, placement.initial, measured)
+        usable = closures[placement.allowed]
+        network = Network(chain, placement.initial, usable, placement.links)
+        decider = Decider(chain, network, placement.initial)
         if scales is None:
-            decision, tried = decider.decide(len(chain.robots))
+            decision, trials = decider.decide(len(chain.robots))
         else:
-            decision, tried = decider.at(scales), []
-        joined = weights(chain, used[decision.taken])
-        few = {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
-        if not few:
+            decision, trials = decider.at(scales), []
+        pairs = weak_pairs(chain, usable[decision.accepted], placement)
+        if not pairs:
             break
-        denied |= few
-    accepted, found, values = decision.taken, decision.scales, network.values(placement.initial)
-    counted = accepted
+        denied |= pairs
+    accepted = counted = decision.accepted
+    scales, values = decision.scales, network.values(placement.initial)
     if accepted.any():
-        found, values, counted = decider.estimate(decision, used.is_independent, scales is None)
-    if measured:
-        accepted = counted
+        scales, values, counted = decider.estimate(decision, usable.is_independent)
 
     def among_all(chosen: np.ndarray) -> np.ndarray:
         result = placement.allowed.copy()
         result[placement.allowed] = chosen
         return result
 
-    return Solution(
-        network.nodes(values), among_all(accepted), among_all(counted), found, placement, decision,
-        [(network.nodes(each.values), among_all(each.agreeing), each.strained) for each in tried],
+    return DriveSolution(
+        network.nodes(values), among_all(accepted), among_all(counted), scales, placement,
+        decision,
+        [(network.nodes(other.values), among_all(other.inliers), other.bend) for other in trials],
     )  # fmt: skip
 
 
-def followed(
-    chain: KeyframeChain, closures: ClosureArrays, measured: bool, last: Solution
-) -> Solution | None:
+def follow(
+    chain: KeyframeChain, closures: ClosureArrays, last: DriveSolution
+) -> DriveSolution | None:
     """
     Add new closures to the last solution, each of which agrees with it or contradicts it.
 
@@ -101,31 +107,28 @@ def followed(
 
     :returns: None where that is not so.
     """
-    known, placement = len(last.accepted), last.placement
+    old, placement = len(last.accepted), last.placement
     if not last.counted.any() or len(placement.links) < len(chain.starts()):
         return None
-    pairs = session_pairs(chain, closures[known:]).tolist()
+    pairs = session_pairs(chain, closures[old:]).tolist()
     if any(a != b and (a, b) not in placement.pairs for a, b in pairs):
         return None
-    nodes = extended(chain, last.nodes, placement.links)
-    number = np.arange(len(closures))
-    numbers = np.concatenate([np.flatnonzero(last.accepted), number[known:]])
-    used, first = closures[numbers], len(numbers) - len(closures) + known
-    network = Network(chain, nodes, used, placement.links)
-    decider = Decider(chain, network, nodes, measured)
+    nodes = extend(chain, last.nodes, placement)
+    numbers = np.flatnonzero(np.append(last.accepted, np.ones(len(closures) - old, bool)))
+    usable, is_old = closures[numbers], numbers < old
+    network = Network(chain, nodes, usable, placement.links)
+    decider = Decider(chain, network, nodes)
     information, values = decider.information(last.scales), network.values(nodes)
-    agree = (network.residuals(information, values) <= network.limit) | (
-        number[: len(used)] < first
-    )
+    agree = is_old | (network.residuals(information, values) <= network.limit)
     far = np.flatnonzero(~agree)
     if len(far):
-        before = np.append(last.counted[last.accepted], np.zeros(len(used) - first))
-        agree[far] = network.deviations(before, far) <= network.limit
+        before = np.append(last.counted[last.accepted], np.zeros((~is_old).sum()))
+        agree[far] = squares(network.innovations(before, far)) <= network.limit
         network.residuals(decider.information(last.decision.scales), values)
-        if (network.deviations(before, far) > network.limit)[agree[far]].any():
+        if (squares(network.innovations(before, far)) > network.limit)[agree[far]].any():
             return None
-    own = decider.counted(agree, used.is_independent)
-    values, _ = decider.fit(information, own, values)
+    own = decider.thin(agree, usable.is_independent)
+    values, _ = network.fit(information, own, values)
     if (network.residuals(information, values)[far][agree[far]] > network.limit).any():
         return None
     accepted, counted = np.zeros((2, len(closures)), bool)
@@ -136,6 +139,5 @@ def followed(
 NOTHING = Solution(
     np.zeros((0, 4, 4)), np.zeros(0, bool), np.zeros(0, bool), np.zeros(0),
     Placement(np.zeros((0, 4, 4)), {}, frozenset(), np.zeros(0, bool)),
-    Decision(np.zeros(0), np.zeros(0, bool), np.zeros((0, 4, 4)), 0.0), [],
 )  # fmt: skip
 """Of a graph without odometry."""

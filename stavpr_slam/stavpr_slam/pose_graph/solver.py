@@ -15,13 +15,13 @@ import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from stavpr_ros.compilation import kernel
+from stavpr_slam.pose_graph import tuning
 
 TINY = 1e-12  # twice the sine of an angle
 SMALL = 1e-5  # radians: of a rotation whose series are cut after two terms
 SERIES = 1e-2  # radians: the same of the derivative of the logarithm
-SPARE = 1.5  # times the active factors: a pattern of so many is used again
-FILLED = 6  # blocks for each active factor: a pattern with more is used again for 2 % more only
 PATTERNS = 16  # that are kept
+ALONE = 1e-9  # least part of its errors that a factor leaves to others
 
 
 @kernel
@@ -55,7 +55,7 @@ def _logarithm(T, twist):
 
 
 @kernel
-def _moved(T, twist, result):
+def _move(T, twist, result):
     """Write a transform times the exponential of a twist."""
     x, y, z = twist[0], twist[1], twist[2]
     angle = math.sqrt(x * x + y * y + z * z)
@@ -113,7 +113,7 @@ def _derivative(twist, derivative):
 
 
 @kernel
-def linearized(poses, ends, motions, information, at, errors, jacobians, local, squared):
+def _linearize(poses, ends, motions, information, at, errors, jacobians, local, deviations):
     """
     Write the errors of factors, their derivatives by the first pose, and the squared deviations.
 
@@ -125,7 +125,7 @@ def linearized(poses, ends, motions, information, at, errors, jacobians, local, 
     d = len(at)
     origin, step, off, twist = np.eye(4), np.eye(4), np.eye(4), np.zeros(6)
     adjoint, derivative = np.zeros((6, 6)), np.zeros((6, 6))
-    own, left = np.empty((d, d)), np.empty((d, d))
+    own, product = np.empty((d, d)), np.empty((d, d))
     for f in range(len(ends)):
         i, j = ends[f]
         _between(origin if i < 0 else poses[i], poses[j], step)
@@ -141,22 +141,22 @@ def linearized(poses, ends, motions, information, at, errors, jacobians, local, 
             adjoint[a + 3, 1] = w * x - u * z
             adjoint[a + 3, 2] = u * y - v * x
         _derivative(twist, derivative)
-        squared[f] = 0.0
+        deviations[f] = 0.0
         for a in range(d):
             errors[f, a] = twist[at[a]]
             for b in range(d):
                 jacobians[f, a, b] = adjoint[at[a], at[b]]
                 own[a, b] = derivative[at[a], at[b]]
-        left[:], local[f] = 0.0, 0.0
-        _add(left, 1.0, information[f], own, False)
-        _add(local[f], 1.0, own.T, left, False)
+        product[:], local[f] = 0.0, 0.0
+        _add(product, 1.0, information[f], own, False)
+        _add(local[f], 1.0, own.T, product, False)
         for a in range(d):
             for b in range(d):
-                squared[f] += information[f, a, b] * errors[f, a] * errors[f, b]
+                deviations[f] += information[f, a, b] * errors[f, a] * errors[f, b]
 
 
 @kernel
-def _add(A, scale, B, C, turned):
+def _add(A, scale, B, C, is_transposed):
     """Add a scaled product of blocks to another one, or its transpose."""
     d = len(A)
     for a in range(d):
@@ -164,7 +164,7 @@ def _add(A, scale, B, C, turned):
             total = 0.0
             for c in range(d):
                 total += B[a, c] * C[c, b]
-            if turned:
+            if is_transposed:
                 A[b, a] += scale * total
             else:
                 A[a, b] += scale * total
@@ -175,13 +175,13 @@ def _assemble(ends, slots, errors, jacobians, information, weights, blocks, grad
     """Write the normal equations; slots: the block of the second pose, the first, and both."""
     blocks[:], gradient[:] = 0.0, 0.0
     d = errors.shape[1]
-    one, left, pull = np.eye(d), np.empty((d, d)), np.empty(d)
+    one, product, pull = np.eye(d), np.empty((d, d)), np.empty(d)
     for f in range(len(ends)):
         w = weights[f]
         if w == 0.0:
             continue
         i, j = ends[f]
-        own, other, both, turned = slots[f]
+        own, other, both, is_transposed = slots[f]
         for a in range(d):
             pull[a] = 0.0
             for b in range(d):
@@ -189,10 +189,10 @@ def _assemble(ends, slots, errors, jacobians, information, weights, blocks, grad
                 blocks[own, a, b] += w * information[f, a, b]
             gradient[j, a] += pull[a]
         if i >= 0:
-            left[:] = 0.0
-            _add(left, w, information[f], jacobians[f], False)
-            _add(blocks[both], 1.0, left, one, turned == 1)
-            _add(blocks[other], 1.0, jacobians[f].T, left, False)
+            product[:] = 0.0
+            _add(product, w, information[f], jacobians[f], False)
+            _add(blocks[both], 1.0, product, one, is_transposed == 1)
+            _add(blocks[other], 1.0, jacobians[f].T, product, False)
             for a in range(d):
                 for b in range(d):
                     gradient[i, b] += pull[a] * jacobians[f, a, b]
@@ -226,17 +226,24 @@ def _decompose(starts, rows, blocks):
     """
     count, d = len(starts) - 1, blocks.shape[1]
     head, link, first = np.full(count, -1), np.full(count, -1), starts[:-1].copy()
-    where, determinant = np.zeros(count, np.int64), 0.0
+    where, pivot, determinant = np.zeros(count, np.int64), np.empty((d, d)), 0.0
     for j in range(count):
         for p in range(starts[j], starts[j + 1]):
             where[rows[p]] = p
         k = head[j]
         while k >= 0:  # columns that have a block in this row
-            following = link[k]
+            after = link[k]
+            pivot[:] = blocks[first[k]]
             for p in range(first[k], starts[k + 1]):
-                _add(blocks[where[rows[p]]], -1.0, blocks[p], blocks[first[k]].T, False)
+                q = where[rows[p]]
+                for a in range(d):
+                    for b in range(d):
+                        total = 0.0
+                        for c in range(d):
+                            total += blocks[p, a, c] * pivot[b, c]
+                        blocks[q, a, b] -= total
             _queue(k, starts, rows, head, link, first)
-            k = following
+            k = after
         determinant += _root(blocks[starts[j]])
         for p in range(starts[j] + 1, starts[j + 1]):
             for a in range(d):
@@ -258,37 +265,42 @@ def _queue(k, starts, rows, head, link, first):
 
 
 @kernel
-def _forward(starts, rows, blocks, first, x):
-    """Solve the lower half in place from a column on, x of shape (count, d) in their order."""
-    count, d = x.shape
-    for j in range(first, count):
-        for a in range(d):
+def _forward(starts, rows, blocks, j, x):
+    """Solve a column of the lower half in place for n right sides, x of shape (count, d, n)."""
+    d, n = x.shape[1:]
+    for a in range(d):
+        for k in range(n):
             for c in range(a):
-                x[j, a] -= blocks[starts[j], a, c] * x[j, c]
-            x[j, a] /= blocks[starts[j], a, a]
-        for p in range(starts[j] + 1, starts[j + 1]):
-            for a in range(d):
+                x[j, a, k] -= blocks[starts[j], a, c] * x[j, c, k]
+            x[j, a, k] /= blocks[starts[j], a, a]
+    own = x[j].copy()
+    for p in range(starts[j] + 1, starts[j + 1]):
+        r = rows[p]
+        for a in range(d):
+            for k in range(n):
+                total = 0.0
                 for c in range(d):
-                    x[rows[p], a] -= blocks[p, a, c] * x[j, c]
+                    total += blocks[p, a, c] * own[c, k]
+                x[r, a, k] -= total
 
 
 @kernel
 def _backward(starts, rows, blocks, x):
-    """Solve the upper half in place."""
-    count, d = x.shape
+    """Solve the upper half in place, x of shape (count, d, 1)."""
+    count, d, _ = x.shape
     for j in range(count - 1, -1, -1):
         for p in range(starts[j] + 1, starts[j + 1]):
             for c in range(d):
                 for a in range(d):
-                    x[j, c] -= blocks[p, a, c] * x[rows[p], a]
+                    x[j, c, 0] -= blocks[p, a, c] * x[rows[p], a, 0]
         for a in range(d - 1, -1, -1):
             for c in range(a + 1, d):
-                x[j, a] -= blocks[starts[j], c, a] * x[j, c]
-            x[j, a] /= blocks[starts[j], a, a]
+                x[j, a, 0] -= blocks[starts[j], c, a] * x[j, c, 0]
+            x[j, a, 0] /= blocks[starts[j], a, a]
 
 
 @kernel
-def _solved(
+def _solve(
     poses, ends, errors, jacobians, information, weights, at, order, slots, starts, rows, result
 ):
     """Write the poses after a step, and return the logarithm of the determinant."""
@@ -298,18 +310,19 @@ def _solved(
     determinant = _decompose(starts, rows, blocks)
     if np.isnan(determinant):
         return determinant
-    x, twist = gradient[order], np.zeros(6)
-    _forward(starts, rows, blocks, 0, x)
+    x, twist = np.expand_dims(gradient[order], 2), np.zeros(6)
+    for j in range(len(order)):
+        _forward(starts, rows, blocks, j, x)
     _backward(starts, rows, blocks, x)
     for k in range(len(order)):
         for a in range(d):
-            twist[at[a]] = x[k, a]
-        _moved(poses[order[k]], twist, result[order[k]])
+            twist[at[a]] = x[k, a, 0]
+        _move(poses[order[k]], twist, result[order[k]])
     return determinant
 
 
 @kernel
-def _spread(
+def _covariances(
     ends, errors, jacobians, information, weights, at, order, slots, starts, rows, chosen, result
 ):
     """Write the covariances of the motions between the ends of some of the factors."""
@@ -317,31 +330,59 @@ def _spread(
     blocks, gradient = np.empty((len(rows), d, d)), np.empty((count, d))
     _assemble(ends, slots, errors, jacobians, information, weights, blocks, gradient)
     determinant = _decompose(starts, rows, blocks)
-    column, x = np.empty(count, np.int64), np.empty((d, count, d))
+    column, x = np.empty(count, np.int64), np.zeros((count, d, d))
     for k in range(count):
         column[order[k]] = k
     for number in range(len(chosen)):
         f = chosen[number]
-        i, j = ends[f]
+        first, second = column[ends[f, 0]], column[ends[f, 1]]
         for a in range(d):
-            x[a], x[a, column[j], a] = 0.0, 1.0
+            x[second, a, a] = 1.0
             for b in range(d):
-                x[a, column[i], b] += jacobians[f, a, b]
-            _forward(starts, rows, blocks, min(column[i], column[j]), x[a])
-        for a in range(d):
-            for b in range(d):
-                result[number, a, b] = (x[a] * x[b]).sum()
+                x[first, b, a] += jacobians[f, a, b]
+        while True:  # the columns that a column fills are those of the ways to the last one
+            j = min(first, second)
+            if j == count:
+                break
+            _forward(starts, rows, blocks, j, x)
+            _add(result[number], 1.0, x[j].T, x[j], False)
+            x[j] = 0.0
+            after = rows[starts[j] + 1] if starts[j] + 1 < starts[j + 1] else count
+            first = after if first == j else first
+            second = after if second == j else second
     return determinant
+
+
+def squares(innovations: np.ndarray) -> np.ndarray:
+    """Return the squared deviations of factors, (n,), see :meth:`Solver.innovations`."""
+    errors, variances = np.split(innovations[:, :-1], 2, axis=1)
+    result: np.ndarray = (errors**2 / (1 + variances)).sum(axis=1)
+    return result
+
+
+def likelihoods(innovations: np.ndarray) -> np.ndarray:
+    """Return the logarithms of their densities, but for the constant of a normal one, (n,)."""
+    variances = 1 + np.split(innovations[:, :-1], 2, axis=1)[1]
+    size = innovations[:, -1] + np.log(variances).sum(axis=1)
+    return np.asarray(-(squares(innovations) + size) / 2)
+
+
+def scale_errors(innovations: np.ndarray, factor: float) -> np.ndarray:
+    """Return innovations where all errors are larger by a factor."""
+    d, result = innovations.shape[1] // 2, innovations.copy()
+    result[:, :d] /= factor
+    result[:, -1] += 2 * d * math.log(factor)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """
-    Where the decomposition has blocks, for some of the factors.
+    Blocks of the decomposition, for some of the factors.
 
     :param order: the poses in the order of elimination, (V,).
     :param starts, rows: blocks of each column, the diagonal first, as in a CSC matrix.
-    :param slots: blocks of each factor: second pose, first pose, both, and whether turned, (m, 4).
+    :param slots: blocks of each factor: second pose, first, both, and whether transposed, (m, 4).
     """
 
     active: np.ndarray
@@ -359,8 +400,8 @@ class Pattern:
         # a Laplacian and little: what fills its root does not vanish along a path
         graph = (graph + diags_array(1e-3 - graph.sum(axis=0))).tocsc()
         options = {'SymmetricMode': True}
-        found = splu(graph, 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, relax=1, options=options)
-        place, L = found.perm_c, found.L.tocsc().sorted_indices()
+        lu = splu(graph, 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, relax=1, options=options)
+        place, L = lu.perm_c, lu.L.tocsc().sorted_indices()
         starts, rows = L.indptr.astype(np.int64), L.indices.astype(np.int64)
         keys = np.repeat(np.arange(count), np.diff(starts)) * count + rows
         first, second = place[ends[:, 0]], place[ends[:, 1]]
@@ -375,8 +416,8 @@ class Solver:
     """
     Solves for poses by factors.
 
-    :param ends, motions: as in :func:`linearized`, (m, 2) and (m, 4, 4).
-    :param at: as in :func:`linearized`.
+    :param ends, motions: as in :func:`_linearize`, (m, 2) and (m, 4, 4).
+    :param at: as in :func:`_linearize`.
     """
 
     ends: np.ndarray
@@ -384,13 +425,13 @@ class Solver:
     at: np.ndarray
     _patterns: list[Pattern] = field(default_factory=list)
 
-    def squared(self, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    def linearize(self, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
         """Return the squared deviations of all factors, (m,), and keep their derivatives."""
         count, d = len(self.ends), len(self.at)
         self._errors, self._local = np.empty((count, d)), np.empty((count, d, d))
         self._jacobians = np.empty((count, d, d))
         result = np.empty(count)
-        linearized(
+        _linearize(
             poses, self.ends, self.motions, information, self.at, self._errors, self._jacobians,
             self._local, result,
         )  # fmt: skip
@@ -404,44 +445,51 @@ class Solver:
         :returns: and the logarithm of the determinant of the square root of the information.
         :raises LinAlgError: the poses have no unique solution.
         """
-        used, result = self._pattern(weights > 0, len(poses)), np.empty_like(poses)
-        determinant = _solved(
+        pattern, result = self._pattern(weights > 0, len(poses)), np.empty_like(poses)
+        determinant = _solve(
             poses, self.ends, self._errors, self._jacobians, self._local, weights, self.at,
-            used.order, used.slots, used.starts, used.rows, result,
+            pattern.order, pattern.slots, pattern.starts, pattern.rows, result,
         )  # fmt: skip
         if not math.isfinite(determinant) or not np.isfinite(result).all():
             raise np.linalg.LinAlgError('the pose graph has no unique solution')
         return result, determinant
 
-    def deviations(self, count: int, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def innovations(
+        self, count: int, weights: np.ndarray, chosen: np.ndarray, spread: np.ndarray | None = None
+    ) -> np.ndarray:
         """
-        Return the squared deviations of factors that do not count, by the errors of both ends.
-
-        At the poses that were linearized at last; a solution that counted such a factor as well
-        would deviate by as much in all.
+        Return how factors differ from what the others expect, at the poses linearized at last.
 
         :param count: number of poses.
         :param weights: of the factors, (m,).
         :param chosen: n of them, which have a first pose.
-        :returns: shape (n,); NaN = the poses have no unique solution.
+        :param spread: covariances of the motions between their ends, (n, d, d); None = as solved.
+        :returns: in rows of 2 d + 1: errors on axes where they do not correlate, in deviations of
+            the factor, variances of what the others expect there, and the logarithm of the
+            determinant of the covariance of the factor.
         """
-        used, d = self._pattern(weights > 0, count), len(self.at)
-        spread = np.empty((len(chosen), d, d))
-        _spread(
-            self.ends, self._errors, self._jacobians, self._local, weights, self.at, used.order,
-            used.slots, used.starts, used.rows, chosen, spread,
-        )  # fmt: skip
-        errors = self._errors[chosen]
-        inner = np.linalg.inv(np.linalg.inv(self._local[chosen]) + spread)
-        result: np.ndarray = np.einsum('ni,nij,nj->n', errors, inner, errors)
-        return result
+        if spread is None:
+            pattern, d = self._pattern(weights > 0, count), len(self.at)
+            spread = np.zeros((len(chosen), d, d))
+            _covariances(
+                self.ends, self._errors, self._jacobians, self._local, weights, self.at,
+                pattern.order, pattern.slots, pattern.starts, pattern.rows, chosen, spread,
+            )  # fmt: skip
+        root = np.linalg.cholesky(self._local[chosen])
+        variances, axes = np.linalg.eigh(root.mT @ spread @ root)
+        variances, counts = variances.clip(0), weights[chosen, None] > 0
+        # factors that count have made errors and variances smaller
+        rest = np.where(counts, (1 - variances).clip(ALONE), 1.0)
+        errors = (axes.mT @ (root.mT @ self._errors[chosen, :, None]))[:, :, 0]
+        size = -2 * np.log(np.einsum('nii->ni', root)).sum(axis=1)
+        return np.column_stack([errors / rest, variances / rest, size])
 
     def _pattern(self, active: np.ndarray, count: int) -> Pattern:
-        used = active.sum()
-        for each in self._patterns:
-            most = (SPARE if len(each.rows) < FILLED * used else 1.02) * used
-            if not (active & ~each.active).any() and each.active.sum() <= most:
-                return each
+        size = active.sum()
+        for pattern in self._patterns:
+            most = (tuning.SPARE if len(pattern.rows) < tuning.FILLED * size else 1.02) * size
+            if not (active & ~pattern.active).any() and pattern.active.sum() <= most:
+                return pattern
         self._patterns = [Pattern.of(self.ends, count, active), *self._patterns[: PATTERNS - 1]]
         return self._patterns[0]
 
@@ -451,6 +499,6 @@ def compile_kernels() -> None:
     ends, count = np.array([[-1, 0], [0, 1]]), 2
     poses, weights = np.tile(np.eye(4), (count, 1, 1)), np.ones(count)
     solver = Solver(ends, poses.copy(), np.arange(6))
-    solver.squared(poses, np.tile(np.eye(6), (count, 1, 1)))
+    solver.linearize(poses, np.tile(np.eye(6), (count, 1, 1)))
     solver.step(poses, weights)
-    solver.deviations(count, weights, np.array([1]))
+    solver.innovations(count, weights, np.array([1]))

@@ -50,8 +50,8 @@ class OdometryTrack:
 
     def _differ(self, a: np.ndarray, b: np.ndarray, share: float) -> bool:
         """Return whether two poses are a share of the distance between keyframes apart."""
-        moved = math.dist(a[:3].tolist(), b[:3].tolist())
-        return moved > share * self._distance or (
+        distance = math.dist(a[:3].tolist(), b[:3].tolist())
+        return distance > share * self._distance or (
             abs(float(a[3:] @ b[3:])) < math.cos(share * self._angle / 2)
         )
 

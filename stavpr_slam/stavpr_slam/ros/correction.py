@@ -43,14 +43,14 @@ class LimitedCorrection:
         seconds = min(max(stamp - self._stamp, 0) / SECOND, MAX_SECONDS)
         self._stamp = stamp
         if self._speed and breaks == self._breaks:
-            shown, wanted = self._current @ odometry, target @ odometry
-            shift = wanted[:3, 3] - shown[:3, 3]
-            turn = Rotation.from_matrix(shown[:3, :3].T @ wanted[:3, :3]).as_rotvec()
+            present, goal = self._current @ odometry, target @ odometry
+            shift = goal[:3, 3] - present[:3, 3]
+            turn = Rotation.from_matrix(present[:3, :3].T @ goal[:3, :3]).as_rotvec()
             far = max(float(np.linalg.norm(shift)), LEVER * float(np.linalg.norm(turn)))
             share = self._speed * seconds / far if far else 1.0
             if share < 1:
-                shown[:3, 3] += share * shift
-                shown[:3, :3] = shown[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-                target = shown @ inverse(odometry)
+                present[:3, 3] += share * shift
+                present[:3, :3] = present[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+                target = present @ inverse(odometry)
         self._current, self._breaks = target, breaks
         return target

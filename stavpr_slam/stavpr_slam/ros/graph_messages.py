@@ -37,7 +37,7 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     if relative.source in (RelativePose.REFUTED, RelativePose.DROPPED):
         return None
     on_map = message.query_index < 0 and message.has_poses
-    known: dict[str, Any] = {
+    on_a_map: dict[str, Any] = {
         'map_id': (message.map_id or 'map') if on_map else '',
         'place_pose': pose_array(message.place_pose) if on_map else None,
     }
@@ -45,13 +45,13 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
         covariance = np.array(relative.pose.covariance).reshape(6, 6)
         return Closure(
             nanoseconds(relative.query_stamp), nanoseconds(relative.place_stamp),
-            pose_array(relative.pose.pose), covariance, relative.is_independent, **known,
+            pose_array(relative.pose.pose), covariance, relative.is_independent, **on_a_map,
         )  # fmt: skip
     if not appearance:
         return None
     stamps = nanoseconds(message.query_stamp), nanoseconds(message.place_stamp)
     by_mounting = np.append(np.zeros(3), pose_array(relative.pose.pose)[3:])
-    return Closure(*stamps, by_mounting, APPEARANCE, False, **known)
+    return Closure(*stamps, by_mounting, APPEARANCE, False, **on_a_map)
 
 
 def pose_array(pose: object) -> np.ndarray:

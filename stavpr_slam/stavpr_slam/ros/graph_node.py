@@ -96,25 +96,25 @@ class PoseGraphNode(ManagedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('pose_graph', **options)
-        given = {
+        values = {
             name: self.declare_parameter(name, default).value
             for name, (default, _) in PARAMETERS.items()
         }
-        self._frame, self._topics = str(given['map_frame']), list(given['loop_closure_topics'])
-        self._appearance = bool(given['appearance_edges'])
-        self._folder = maps_folder(given['maps_folder'])
+        self._frame, self._topics = str(values['map_frame']), list(values['loop_closure_topics'])
+        self._appearance = bool(values['appearance_edges'])
+        self._folder = maps_folder(values['maps_folder'])
         for name in ('keyframe_distance', 'max_odometry_gap'):
-            if not (math.isfinite(given[name]) and given[name] > 0):
-                raise SettingsError(f'{name} = {given[name]}: expected a number above 0')
-        self._speed, self._robots = given['max_correction_speed'], list(given['robots'])
+            if not (math.isfinite(values[name]) and values[name] > 0):
+                raise SettingsError(f'{name} = {values[name]}: expected a number above 0')
+        self._speed, self._robots = values['max_correction_speed'], list(values['robots'])
         if not (math.isfinite(self._speed) and self._speed >= 0):
             raise SettingsError(f'max_correction_speed = {self._speed}: expected 0 or more m/s')
         if len({*self._robots}) < max(len(self._robots), 1):
             raise SettingsError(f'robots = {self._robots}: expected different names, or one ""')
         gc.freeze()  # collecting what is imported would take .15 s, without any odometry
-        keyframes = ChainSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
+        keyframes = ChainSettings(values['keyframe_distance'], max_gap=values['max_odometry_gap'])
         self._settings = GraphSettings(keyframes)
-        self._tf_type: Any = tf_message() if given['publish_tf'] else None
+        self._tf_type: Any = tf_message() if values['publish_tf'] else None
         self._graph: GraphProcess | None = None
         self._entities: list[Any] = []
         self._made_publishers: list[Any] = []
@@ -129,7 +129,7 @@ class PoseGraphNode(ManagedNode):
         ):
             repeat_responses(self.create_service(kind, name, serve, callback_group=group()))
         self._start: Timer | None = None
-        if given['autostart']:
+        if values['autostart']:
             self._start = self.create_timer(0.0, self._on_start, group(), steady)
 
     def _on_start(self) -> None:
@@ -143,8 +143,8 @@ class PoseGraphNode(ManagedNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Create the publishers, and start the process of the graph."""
 
-        def make(*given: Any) -> Any:
-            self._made_publishers.append(self.create_lifecycle_publisher(*given))
+        def make(*arguments: Any) -> Any:
+            self._made_publishers.append(self.create_lifecycle_publisher(*arguments))
             return self._made_publishers[-1]
 
         self._edges = make(MarkerArray, '~/edges', LATCHED)
@@ -227,8 +227,8 @@ class PoseGraphNode(ManagedNode):
     def _on_odometry(self, robot: str, message: Odometry) -> None:
         assert self._graph is not None
         pose, stamp = odometry_pose(message), nanoseconds(message.header.stamp)
-        given = message.pose.covariance
-        covariance = given.tolist() if given.any() else None
+        stated = message.pose.covariance
+        covariance = stated.tolist() if stated.any() else None
         self.counts['odometry'] += 1
         self._graph.add(RobotOdometry(robot, stamp, pose.tolist(), covariance))
         try:

@@ -174,13 +174,13 @@ class GraphServer:
         for robot in self._origins:
             stamps, before, after = graph.chain.trajectory(solved, robot)
             trajectories[robot] = stamps, to_poses(before), to_poses(after)
-        known = [e for e in graph.edges if max(e.query, e.place) < len(solved)]
-        ends = np.array([(e.query, e.place) for e in known], int).reshape(-1, 2)
-        taken, points = np.array([e.accepted for e in known], bool), solved[ends, :3, 3]
-        return Paths(trajectories, points[taken], points[~taken])
+        edges = [e for e in graph.edges if max(e.query, e.place) < len(solved)]
+        ends = np.array([(e.query, e.place) for e in edges], int).reshape(-1, 2)
+        is_accepted, points = np.array([e.accepted for e in edges], bool), solved[ends, :3, 3]
+        return Paths(trajectories, points[is_accepted], points[~is_accepted])
 
 
-def run_server(connection: Connection, parent: int, *given: Any) -> None:
+def run_server(connection: Connection, parent: int, *arguments: Any) -> None:
     """Serve requests until the parent has ended; in the child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal, which the parent obeys
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -188,7 +188,7 @@ def run_server(connection: Connection, parent: int, *given: Any) -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
     if os.getppid() != parent:
         return
-    server = GraphServer(*given)
+    server = GraphServer(*arguments)
     with suppress(EOFError, OSError):
         while True:
             connection.send(server.serve(*connection.recv()))
@@ -267,8 +267,8 @@ class GraphProcess:
     def _start(self) -> None:
         self._child, context = None, get_context('spawn')
         self._connection, other = context.Pipe()
-        given = other, os.getpid(), self._settings, self._origins
-        child = context.Process(target=run_server, args=given, daemon=True)
+        arguments = other, os.getpid(), self._settings, self._origins
+        child = context.Process(target=run_server, args=arguments, daemon=True)
         child.start()
         other.close()
         self._child = child

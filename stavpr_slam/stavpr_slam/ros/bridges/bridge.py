@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What all bridges have in common: parameters, loop closures in, counts, diagnostics."""
+"""Base of all bridges: parameters, loop closures in, counts, diagnostics."""
 
 from collections import Counter
 import importlib
@@ -8,23 +8,14 @@ import math
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.messages import nanoseconds, odometry_pose
-from stavpr_slam.pose_graph import Closure
-from stavpr_slam.ros.bridges.external_keyframes import (
-    ExternalKeyframes,
-    keyframe_edge,
-    KeyframeEdge,
-)
-from stavpr_slam.ros.graph_messages import closure_of, CLOSURE_QOS, ODOMETRY_QOS
+from stavpr_slam.ros.graph_messages import CLOSURE_QOS
 
 PERIOD = 1.0  # seconds between two diagnostics
-MAX_PENDING = 1000  # closures that wait for keyframes
 REMEDIES = {
     'without_relative_pose': 'the closures are of appearance alone, refuted by PnP, or dropped at '
     'load (relative_pose.source NONE, REFUTED, DROPPED; relative_pose.reason has the cause): set '
@@ -38,7 +29,7 @@ REMEDIES = {
 }
 
 
-def interfaces(package: str, source: str, kind: str = 'msg') -> Any:
+def interfaces(package: str, source: str, kind: str) -> Any:
     """
     Import the interfaces of another package.
 
@@ -117,91 +108,3 @@ class Bridge(Node):
     def on_timer(self) -> None:
         """Publish the diagnostics."""
         self._diagnostics.publish(one_status(self, 'bridge', *self.status(), self.counts))
-
-
-class EdgeBridge(Bridge):
-    """Passes loop closures on as edges between the keyframes of the target."""
-
-    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {
-        'max_keyframe_gap': (2.0, 'seconds between an image and its keyframe at most, above 0'),
-        'independent_only': (
-            True,
-            'only edges whose errors do not correlate with those of the edge before',
-        ),
-        'pnp_only': (False, 'only edges by PnP, none that are aligned by odometry'),
-    }
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._pending: list[tuple[LoopClosure, Closure]] = []
-        self._sent: set[tuple[int, int]] = set()
-        self.keyframes = ExternalKeyframes(self.seconds('max_keyframe_gap'))
-        self.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
-
-    def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
-        """Pass an edge on."""
-        raise NotImplementedError
-
-    def ready(self) -> bool:
-        """Return whether the target takes edges; they wait until it does."""
-        return True
-
-    def add_keyframe(self, stamp: int, number: int) -> None:
-        """Add a keyframe of the target, stamp in ns, and send the closures that waited for it."""
-        if stamp > 0:
-            self.keyframes.add(stamp, number)
-        self._send_pending()
-
-    def on_timer(self) -> None:
-        """Send what waited for the target, and publish the diagnostics."""
-        self._send_pending()
-        self.counts['waiting'] = len(self._pending)
-        self.counts['keyframes'] = len(self.keyframes)
-        super().on_timer()
-
-    def _on_odometry(self, message: Odometry) -> None:
-        try:
-            self.keyframes.odometry.add(nanoseconds(message.header.stamp), odometry_pose(message))
-        except InputError as error:
-            self.counts['invalid_odometry'] += 1
-            self.get_logger().warning(f'odometry rejected: {error}', throttle_duration_sec=10.0)
-
-    def take(self, message: LoopClosure) -> str:
-        """Let an edge wait for its keyframes."""
-        relative = message.relative_pose
-        if message.query_index < 0:
-            return 'on_a_map'
-        closure = closure_of(message, appearance=False)
-        if closure is None:
-            return 'without_relative_pose'
-        if self.given['pnp_only'] and relative.source != relative.PNP:
-            return 'not_pnp'
-        if self.given['independent_only'] and not relative.is_independent:
-            return 'not_independent'
-        self._pending.append((message, closure.checked()))
-        if len(self._pending) > MAX_PENDING:
-            del self._pending[0]
-            self.counts['no_keyframe'] += 1
-        self._send_pending()
-        return ''
-
-    def _send_pending(self) -> None:
-        """Send the edges whose keyframes are known; those of later stamps wait."""
-        keyframes = self.keyframes
-        if not self.ready():
-            return
-        waiting = []
-        for message, closure in self._pending:
-            if closure.query_stamp > keyframes.newest:
-                waiting.append((message, closure))
-                continue
-            query, place = map(keyframes.near, (closure.query_stamp, closure.place_stamp))
-            if query is None or place is None:
-                self.counts['no_keyframe'] += 1
-            elif (place[0], query[0]) in self._sent or place[0] == query[0]:
-                self.counts['same_keyframes'] += 1
-            else:
-                self._sent.add((place[0], query[0]))
-                self.send(keyframe_edge(closure, place, query), message)
-                self.counts['sent'] += 1
-        self._pending = waiting

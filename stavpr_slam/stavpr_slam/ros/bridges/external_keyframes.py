@@ -3,32 +3,15 @@
 """The keyframes of another back end: its loop closures are between those, not between images."""
 
 from bisect import bisect_left
-from dataclasses import dataclass
 
 import numpy as np
-from stavpr_ros.mapping.transforms import inverse, matrices
+from stavpr_ros.mapping.transforms import cross, inverse, matrices
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 
 MAX_KEYFRAMES = 1_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class KeyframeEdge:
-    """
-    A loop closure between two keyframes of another back end.
-
-    :param place, query: their numbers there.
-    :param transform: pose of the query's keyframe in the frame of the place's, shape (4, 4).
-    :param covariance: x y z, rotations about the fixed axes of the place's, shape (6, 6).
-    """
-
-    place: int
-    query: int
-    transform: np.ndarray
-    covariance: np.ndarray
 
 
 class ExternalKeyframes:
@@ -83,33 +66,32 @@ class ExternalKeyframes:
 
 
 def keyframe_edge(
-    closure: Closure, place: tuple[int, np.ndarray], query: tuple[int, np.ndarray]
-) -> KeyframeEdge:
+    closure: Closure, place: np.ndarray, query: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Move a loop closure to the keyframes next to its images.
 
-    :param place, query: keyframe, and the transform (4, 4) from it to the image, whose errors are
-        left out.
+    :param place, query: transforms (4, 4) from the keyframe to the image, whose errors are left
+        out.
+    :returns: the pose of the query's keyframe in the frame of the place's, (4, 4), and its
+        covariance: x y z, rotations about the fixed axes of the place's, (6, 6).
     """
-    before, after = place[1], inverse(query[1])
-    measured = matrices(closure.pose)
+    after, motion = inverse(query), matrices(closure.pose)
     # t' = A (t + R b): an error of the rotation R also moves the end of the motion b
-    x, y, z = measured[:3, :3] @ after[:3, 3]
     jacobian = np.eye(6)
-    jacobian[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
-    turn = np.kron(np.eye(2), before[:3, :3])
-    jacobian = turn @ jacobian
-    return KeyframeEdge(
-        place[0], query[0], before @ measured @ after, jacobian @ closure.covariance @ jacobian.T
-    )
+    jacobian[:3, 3:] = -cross((motion[:3, :3] @ after[:3, 3])[None])[0]
+    jacobian = np.kron(np.eye(2), place[:3, :3]) @ jacobian
+    return place @ motion @ after, jacobian @ closure.covariance @ jacobian.T
 
 
-def body_information(edge: KeyframeEdge) -> np.ndarray:
+def body_information(transform: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """
-    Return the inverse of the covariance in the axes of the query, x y z first, shape (6, 6).
+    Return the inverse of a covariance in the axes of the query, x y z first, shape (6, 6).
 
     g2o and its file format have the information of an edge in this form.
+
+    :param transform, covariance: see :func:`keyframe_edge`.
     """
-    turn = np.kron(np.eye(2), edge.transform[:3, :3].T)
-    result: np.ndarray = np.linalg.inv(turn @ edge.covariance @ turn.T)
+    turn = np.kron(np.eye(2), transform[:3, :3].T)
+    result: np.ndarray = np.linalg.inv(turn @ covariance @ turn.T)
     return (result + result.T) / 2

@@ -35,7 +35,7 @@ class PoseBridge(Bridge):
         """Return the frame_id of the pose."""
         return str(message.pose_frame)
 
-    def wanted(self, message: LoopClosure) -> str:
+    def reason_to_skip(self, message: LoopClosure) -> str:
         """Return why a pose is left out, empty = it is not."""
         return '' if message.relative_pose.is_independent else 'not_independent'
 
@@ -50,7 +50,7 @@ class PoseBridge(Bridge):
         if self.given['pnp_only'] and relative.source != relative.PNP:
             return 'not_pnp'
         closure = closure.checked()
-        if cause := self.wanted(message):
+        if cause := self.reason_to_skip(message):
             return cause
         place = matrices(normalize_pose(pose_array(message.place_pose)))
         turn = np.kron(np.eye(2), place[:3, :3])
@@ -84,9 +84,9 @@ class RobotLocalizationBridge(PoseBridge):
         self._gap = round(self.seconds('relocalization_gap') * SECOND)
         self._last = -self._gap - 1
 
-    def wanted(self, message: LoopClosure) -> str:
-        """Leave out all but the first closure after a gap."""
+    def reason_to_skip(self, message: LoopClosure) -> str:
+        """Return why all but the first closure after a gap are left out."""
         stamp = nanoseconds(message.relative_pose.query_stamp)
-        lost = not 0 <= stamp - self._last <= self._gap
+        is_new = not 0 <= stamp - self._last <= self._gap
         self._last = stamp
-        return '' if lost else 'not_relocalized'
+        return '' if is_new else 'not_relocalized'

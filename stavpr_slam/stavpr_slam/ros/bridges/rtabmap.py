@@ -2,57 +2,120 @@
 # SPDX-License-Identifier: Apache-2.0
 """RTAB-Map: edges by its service ``add_link``, or poses on a map by its topic ``global_pose``."""
 
-from typing import Any
+from typing import Any, ClassVar
 
-from geometry_msgs.msg import Transform
-import numpy as np
+from nav_msgs.msg import Odometry
 from stavpr_msgs.msg import LoopClosure
+from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import to_poses
-from stavpr_ros.ros.messages import nanoseconds, transform_message
-from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
-from stavpr_slam.ros.bridges.external_keyframes import body_information, KeyframeEdge
+from stavpr_ros.ros.messages import nanoseconds, odometry_pose, transform_message
+from stavpr_slam.pose_graph import Closure
+from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
+from stavpr_slam.ros.bridges.external_keyframes import (
+    body_information,
+    ExternalKeyframes,
+    keyframe_edge,
+)
 from stavpr_slam.ros.bridges.poses import PoseBridge
+from stavpr_slam.ros.graph_messages import closure_of, ODOMETRY_QOS
 
 PACKAGE = 'rtabmap_msgs', 'ros-jazzy-rtabmap-msgs'
 USER_CLOSURE = 4  # rtabmap::Link::kUserClosure
+MAX_PENDING = 1000  # closures that wait for keyframes
 
 
-def transform_of(transform: np.ndarray) -> Transform:
-    """Return a transform (4, 4) as a message."""
-    return transform_message(to_poses(transform), '', '').transform
-
-
-class RtabmapBridge(EdgeBridge):
+class RtabmapBridge(Bridge):
     """
-    Adds loop closures to the graph of RTAB-Map as user closures.
+    Adds loop closures to the graph of RTAB-Map as user closures, between its keyframes.
 
     The nodes are those of ``rtabmap/info``: ``ref_id`` at ``header.stamp``. RTAB-Map checks the
     graph with the new link (RGBD/OptimizeMaxError) and does not report the result.
     """
 
     NAME = 'rtabmap'
+    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {
+        'max_keyframe_gap': (2.0, 'seconds between an image and its keyframe at most, above 0'),
+        'independent_only': (
+            True,
+            'only edges whose errors do not correlate with those of the edge before',
+        ),
+        'pnp_only': (False, 'only edges by PnP, none that are aligned by odometry'),
+    }
 
     def __init__(self) -> None:
-        self._messages: Any = interfaces(*PACKAGE)
+        self._messages: Any = interfaces(*PACKAGE, 'msg')
         self._service: Any = interfaces(*PACKAGE, 'srv').AddLink
         super().__init__()
+        self._pending: list[Closure] = []
+        self._sent: set[tuple[int, int]] = set()
+        self._keyframes = ExternalKeyframes(self.seconds('max_keyframe_gap'))
         self._client = self.create_client(self._service, 'rtabmap/add_link')
+        self.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
         self.create_subscription(self._messages.Info, 'rtabmap/info', self._on_info, 100)
 
-    def ready(self) -> bool:
-        """Return whether the service is there."""
-        return bool(self._client.service_is_ready())
+    def on_timer(self) -> None:
+        """Send what waited for RTAB-Map, and publish the diagnostics."""
+        self._send_pending()
+        self.counts['waiting'] = len(self._pending)
+        self.counts['keyframes'] = len(self._keyframes)
+        super().on_timer()
 
     def _on_info(self, message: Any) -> None:
-        if message.ref_id > 0:
-            self.add_keyframe(nanoseconds(message.header.stamp), message.ref_id)
+        stamp = nanoseconds(message.header.stamp)
+        if message.ref_id > 0 and stamp > 0:
+            self._keyframes.add(stamp, message.ref_id)
+        self._send_pending()
 
-    def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
-        """Request the link from the place to the query."""
-        link = self._messages.Link(from_id=edge.place, to_id=edge.query, type=USER_CLOSURE)
-        link.transform = transform_of(edge.transform)
-        link.information = body_information(edge).ravel()
-        self._client.call_async(self._service.Request(link=link))
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            self._keyframes.odometry.add(nanoseconds(message.header.stamp), odometry_pose(message))
+        except InputError as error:
+            self.counts['invalid_odometry'] += 1
+            self.get_logger().warning(f'odometry rejected: {error}', throttle_duration_sec=10.0)
+
+    def take(self, message: LoopClosure) -> str:
+        """Queue a closure until its keyframes are known."""
+        relative = message.relative_pose
+        if message.query_index < 0:
+            return 'on_a_map'
+        closure = closure_of(message, appearance=False)
+        if closure is None:
+            return 'without_relative_pose'
+        if self.given['pnp_only'] and relative.source != relative.PNP:
+            return 'not_pnp'
+        if self.given['independent_only'] and not relative.is_independent:
+            return 'not_independent'
+        self._pending.append(closure.checked())
+        if len(self._pending) > MAX_PENDING:
+            del self._pending[0]
+            self.counts['no_keyframe'] += 1
+        self._send_pending()
+        return ''
+
+    def _send_pending(self) -> None:
+        """Request the links whose keyframes are known; those of later stamps wait."""
+        keyframes = self._keyframes
+        if not self._client.service_is_ready():
+            return
+        waiting = []
+        for closure in self._pending:
+            if closure.query_stamp > keyframes.newest:
+                waiting.append(closure)
+                continue
+            query, place = map(keyframes.near, (closure.query_stamp, closure.place_stamp))
+            if query is None or place is None:
+                self.counts['no_keyframe'] += 1
+            elif (place[0], query[0]) in self._sent or place[0] == query[0]:
+                self.counts['same_keyframes'] += 1
+            else:
+                self._sent.add((place[0], query[0]))
+                transform, covariance = keyframe_edge(closure, place[1], query[1])
+                link = self._messages.Link(from_id=place[0], to_id=query[0], type=USER_CLOSURE)
+                link.transform = transform_message(to_poses(transform), '', '').transform
+                link.information = body_information(transform, covariance).ravel()
+                self._client.call_async(self._service.Request(link=link))
+                self.counts['sent'] += 1
+        self._pending = waiting
 
 
 class GlobalPoseBridge(PoseBridge):

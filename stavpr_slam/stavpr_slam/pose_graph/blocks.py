@@ -1,0 +1,247 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Graphs of other programs: closures come in blocks by time, each decided from the last solution.
+
+The odometry goes ahead of the closures, and each closure is an event of its own. One is right if
+that is 20 times as probable as a place anywhere on the map, by the errors of the solution at both
+ends and the part of all closures that are right; it is left out where that is no longer probable.
+The errors that the file states are right up to a factor, which the closures show.
+"""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from stavpr_slam.pose_graph import tuning
+from stavpr_slam.pose_graph.closures import ClosureArrays
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
+from stavpr_slam.pose_graph.network import Network
+from stavpr_slam.pose_graph.sessions import extend, Pair, place, Placement, weak_pairs
+from stavpr_slam.pose_graph.solution import Solution
+from stavpr_slam.pose_graph.solver import likelihoods, scale_errors, squares
+
+PASSES = False, True  # over the closures of a block: again for those that agree by now
+Inliers = tuple[np.ndarray, np.ndarray]  # which closures agree, (n,), and the variables
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """
+    Evidence on n closures, and on the errors that the file states.
+
+    :param space: logarithm of the poses of the map, :attr:`Network.room`.
+    :param innovations: of each closure when it was compared with a solution at last, see
+        :meth:`Solver.innovations`, in errors with the factor of the odometry.
+    :param factor: on the errors that the file states.
+    :param prior: logarithm of the odds that a closure is right.
+    :param search_count: closures of the last search of the factor.
+    """
+
+    space: float
+    innovations: np.ndarray
+    factor: float = 1.0
+    prior: float = 0.0
+    search_count: int = 0
+
+    def resize(self, space: float, count: int) -> 'Beliefs':
+        """Return a copy for a number of closures, of which new ones are improbable."""
+        rows = np.zeros((count, self.innovations.shape[1]))
+        rows[:, -1] = np.inf
+        rows[: len(self.innovations)] = self.innovations[:count]
+        return replace(self, space=space, innovations=rows)
+
+    def odds(self, rows: np.ndarray) -> np.ndarray:
+        """Return the logarithm of the odds that closures are right, by their innovations."""
+        return self.prior + self.space + likelihoods(rows)
+
+    def search_factor(self, rows: np.ndarray, factors: np.ndarray) -> 'Beliefs':
+        """Return these with the best factor on all errors, in parts of the last one."""
+        factors = np.array([1.0, *factors])
+        densities = np.array([likelihoods(scale_errors(rows, factor)) for factor in factors])
+        ratio, prior = np.exp((densities + self.space).clip(-50, 50)), np.array([[0.5]])
+        for _ in range(tuning.MAX_STEPS):  # the part of the closures that are right
+            right = prior * ratio / (prior * ratio + 1 - prior)
+            prior = (right.sum(axis=1, keepdims=True) + 1) / (ratio.shape[1] + 2)
+        evidence = np.log(prior * ratio + 1 - prior).sum(axis=1)
+        # many false ones nearby fit large errors without being certain, and one fits by chance
+        is_certain = evidence >= tuning.CERTAIN * right.sum(axis=1).clip(tuning.JOINS)
+        evidence[1:] = np.where(is_certain, evidence - tuning.LOOSER, -np.inf)[1:]
+        best = int(np.argmax(evidence))
+        return replace(
+            self, innovations=scale_errors(self.innovations, factors[best]),
+            factor=float(self.factor * factors[best]),
+            prior=math.log(prior[best, 0] / (1 - prior[best, 0])),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSolution(Solution):
+    """The nodes of a graph of another program, and the evidence on its closures."""
+
+    beliefs: Beliefs
+
+
+def decide_in_blocks(
+    chain: KeyframeChain, closures: ClosureArrays, last: Solution
+) -> MeasuredSolution:
+    """
+    Add new closures to the last solution, in blocks by time.
+
+    :param last: of the first of the closures; :data:`NOTHING` = all are new.
+    """
+    denied = set[Pair]()
+    while True:
+        solution = _Blocks(chain, closures, last, place(chain, closures, denied)).solution()
+        pairs = weak_pairs(chain, closures[solution.accepted], solution.placement)
+        if not pairs:
+            return solution
+        denied |= pairs
+
+
+class _Blocks:
+    """Adds closures in blocks; ``_own`` and ``_network`` are of the present one."""
+
+    def __init__(
+        self, chain: KeyframeChain, closures: ClosureArrays, last: Solution, placement: Placement
+    ) -> None:
+        self._chain, self._closures, self._placement = chain, closures, placement
+        self._latest = np.maximum(closures.query, closures.place)
+        count, old, self._nodes = len(closures), len(last.accepted), last.nodes
+        self._is_old = np.arange(count) < old
+        self._accepted = np.zeros(count, bool)
+        self._accepted[:old] = last.accepted & placement.allowed[:old]
+        self._network = network = Network(chain, placement.initial, closures, placement.links)
+        beliefs = Beliefs(network.room, np.zeros((0, 2 * network.freedom + 1)))
+        if isinstance(last, MeasuredSolution):
+            beliefs = last.beliefs
+        self._beliefs = beliefs.resize(network.room, count)
+        self._searches = count > 0 and count >= tuning.SEARCH * beliefs.search_count
+        if self._searches:
+            sample = self._one_per_run(np.arange(count))
+            ends = chain.session[closures.query[sample]], chain.session[closures.place[sample]]
+            sample = sample[ends[0] == ends[1]]
+            self._set_odometry()
+            network.residuals(self._odometry, network.values(placement.initial))
+            rows, new = network.beside_odometry(sample), ~self._is_old[sample]
+            self._beliefs.innovations[sample[new]] = rows[new]
+            factors = tuning.FACTORS / self._beliefs.factor
+            self._beliefs = self._beliefs.search_factor(rows, factors)
+            self._beliefs = replace(self._beliefs, search_count=count)
+
+    def _set_odometry(self) -> None:
+        """Set the information of all factors of the network at the present errors."""
+        factor = self._beliefs.factor
+        self._odometry = self._network.odometry(np.full(len(self._chain), factor), factor)
+
+    def _one_per_run(self, numbers: np.ndarray) -> np.ndarray:
+        """Return closures of which neighboring nodes have one: groups may be wrong together."""
+        runs = self._latest[numbers] // tuning.LONGEST
+        return np.asarray(numbers[np.unique(runs, return_index=True)[1]])
+
+    def solution(self) -> MeasuredSolution:
+        """Return the solution with all closures."""
+        count, seen, is_whole = len(self._chain), self._is_old.copy(), not self._is_old.any()
+        step = max(1, count // tuning.BLOCKS)
+        for end in (*range(len(self._nodes) + step, count, step), count):
+            part, is_last = self._chain.until(end), is_whole and end == count
+            self._nodes = extend(part, self._nodes, self._placement)
+            usable = self._placement.allowed & (self._latest < end)
+            if (usable & ~seen).any() or is_last:
+                self._decide(part, np.flatnonzero(usable), ~seen[usable], is_last)
+            seen |= usable
+        scales = np.full(len(self._chain.robots), self._beliefs.factor)
+        return MeasuredSolution(
+            self._nodes, self._accepted, self._accepted, scales, self._placement, self._beliefs
+        )
+
+    def _decide(self, part: KeyframeChain, own: np.ndarray, new: np.ndarray, swaps: bool) -> None:
+        """
+        Decide on the closures of a block.
+
+        :param own: numbers of all closures up to its end.
+        :param new: those of them that are new, bool.
+        :param swaps: leave out weak ones on trial.
+        """
+        self._own = own
+        self._network = Network(part, self._nodes, self._closures[own], self._placement.links)
+        network, limit = self._network, self._network.limit * tuning.TAILS
+        network.limit, network.room = limit, self._beliefs.space
+        values, accepted = network.values(self._nodes), self._accepted[own]
+        self._set_odometry()
+        network.residuals(self._odometry, values)
+        for again in PASSES:
+            rows = self._beliefs.innovations[own]
+            if again:
+                new = ~accepted & (squares(rows) <= limit) & (self._beliefs.odds(rows) > 0)
+            if not new.any():
+                break
+            rows[new] = network.innovations(accepted, np.flatnonzero(new))
+            self._beliefs.innovations[own] = rows
+            if self._searches:
+                rows, factors = self._beliefs.innovations, tuning.FACTORS[tuning.FACTORS < 1]
+                sample = self._one_per_run(np.flatnonzero(np.isfinite(rows[:, -1])))
+                self._beliefs = self._beliefs.search_factor(rows[sample], 1 / factors)
+                self._set_odometry()
+                rows = self._beliefs.innovations[own]
+            passes = (squares(rows) <= limit) & (self._beliefs.odds(rows) > tuning.CERTAIN)
+            passes = new & (passes | network.new_joins(accepted))
+            if not passes.any():
+                continue
+            inliers, values = self._drop_improbable(*self._fit(accepted | passes, values))
+            if (inliers == accepted).all():
+                break
+            accepted = inliers
+        if swaps and accepted.any():
+            accepted, values = self._swap_weak(accepted, values)
+        self._accepted[own], self._nodes = accepted, network.nodes(values)
+
+    def _fit(self, chosen: np.ndarray, values: np.ndarray) -> Inliers:
+        """Solve for closures, without those that contradict others."""
+        network, odometry = self._network, self._odometry
+        values, _ = network.fit(odometry, chosen, values)
+        inliers = chosen & (network.residuals(odometry, values) <= network.limit)
+        if (inliers != chosen).any():
+            values, _ = network.fit(odometry, inliers, values)
+        return inliers, values
+
+    def _drop_improbable(self, inliers: np.ndarray, values: np.ndarray) -> Inliers:
+        """
+        Leave out, one by one, closures that are less probable than a place anywhere.
+
+        A false one may have a small residual: it bends the odometry, and without it is far away.
+        """
+        network, rows = self._network, self._beliefs.innovations
+        while inliers.any():
+            weak = np.flatnonzero(inliers)
+            weak = weak[np.argsort(self._beliefs.odds(rows[self._own[weak]]))[: tuning.WEAKEST]]
+            rows[self._own[weak]] = network.innovations(inliers, weak)
+            odds = self._beliefs.odds(rows[self._own[weak]])
+            if odds.min() >= 0:
+                break
+            inliers = inliers & (np.arange(len(inliers)) != weak[np.argmin(odds)])
+            values, _ = network.fit(self._odometry, inliers, values)
+        return inliers, values
+
+    def _swap_weak(self, accepted: np.ndarray, values: np.ndarray) -> Inliers:
+        """Leave out a weak closure and those beside it, for others, where that is evidence."""
+        network, odometry, numbers = self._network, self._odometry, np.arange(len(accepted))
+        _, evidence = network.fit(odometry, accepted, values)
+        odds = self._beliefs.odds(self._beliefs.innovations[self._own])
+        for weak in np.argsort(np.where(accepted, odds, np.inf))[: tuning.WEAKEST]:
+            away = np.abs([ends - ends[weak] for ends in (network.query, network.place)])
+            others = away.max(axis=0) >= tuning.LONGEST
+            trial = accepted & others
+            new = numbers[others & ~accepted]
+            new = new[np.argsort(-odds[new])[: tuning.PLAUSIBLE]]
+            if not accepted[weak] or not len(new):
+                continue
+            trial_values, _ = network.fit(odometry, trial, values)
+            rows = network.innovations(trial, new)
+            fits = (squares(rows) <= network.limit) & (self._beliefs.odds(rows) > 0)
+            trial |= np.isin(numbers, new[fits])
+            trial, trial_values = self._fit(trial, trial_values)
+            trial_values, trial_evidence = network.fit(odometry, trial, trial_values)
+            if trial_evidence > evidence:
+                accepted, values, evidence = trial, trial_values, trial_evidence
+        return accepted, values
