@@ -3,8 +3,8 @@
 """
 The benchmarks of pose graph papers with false closures, beside GNC and Cauchy of GTSAM, and PCM.
 
-False closures are drawn with relative poses of right ones: at random nodes, in groups of 10
-successive nodes, or in such groups at most 40 nodes apart. A run succeeds where its ATE against
+False closures are drawn as by Vertigo, with relative poses of right ones: at random nodes, at most
+40 nodes apart, in groups of 10 successive nodes, or in such groups at most 40 nodes apart. A run succeeds where its ATE against
 the solution of the graph without them is at most 1 % of the diagonal of that solution. Files are
 in the folder pose_graphs of STAVPR_DATA.
 
@@ -38,7 +38,7 @@ from stavpr_slam.pose_graph.g2o import Edge, graph_of, read_edges
 from stavpr_slam.pose_graph.transforms import adjoints
 
 FILES = 'MIT', 'intel', 'manhattan', 'smallGrid3D', 'sphere2500', 'parking-garage'
-KINDS = {'random': (1, 0), 'grouped': (10, 0), 'locally grouped': (10, 40)}
+KINDS = {'random': (1, 0), 'local': (1, 40), 'grouped': (10, 0), 'locally grouped': (10, 40)}
 SHARES = 0.1, 0.3, 0.5
 ORDER = [3, 4, 5, 0, 1, 2]  # rotation first
 CODE = 'stavpr_slam/stavpr_slam/pose_graph'
