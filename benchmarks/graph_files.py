@@ -4,9 +4,9 @@
 The benchmarks of pose graph papers with false closures, beside GNC and Cauchy of GTSAM, and PCM.
 
 False closures are drawn as by Vertigo, with relative poses of right ones: at random nodes, at most
-40 nodes apart, in groups of 10 successive nodes, or in such groups at most 40 nodes apart. A run succeeds where its ATE against
-the solution of the graph without them is at most 1 % of the diagonal of that solution. Files are
-in the folder pose_graphs of STAVPR_DATA.
+40 nodes apart, in groups of 10 successive nodes, or in such groups at most 40 nodes apart. A run
+succeeds where its ATE against the solution of the graph without them is at most 1 % of the
+diagonal of that solution. Files are in the folder pose_graphs of STAVPR_DATA.
 
 Writes each cell (file, method, kind, share) to benchmarks/results/graph_files.json as soon as it
 is measured, and goes on where it was ended: cells of the present code are kept, others are

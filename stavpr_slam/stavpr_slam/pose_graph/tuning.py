@@ -5,7 +5,8 @@ Tuned numbers of the pose graph.
 
 Drives: chosen on KITTI 00 and 08 and the demonstration's world of seed 60, checked on KITTI 05, 06
 and 09 and seed 61. Graphs of other programs: chosen on MIT, smallGrid3D, intel, parking-garage and
-a city-like graph. docs/slam.md has half and double of them, and the case that fails without each.
+a city-like graph. benchmarks/results/pose_graph.md has half and double of them, and what fails
+without each rule.
 """
 
 import math
