@@ -243,14 +243,16 @@ def test_edges_are_rigid_motions(tmp_path):
 
 
 def with_false(
-    folder, name: str, share: float, group: int, seed: int, near: int = 0, alone: bool = False
-):
+    folder, name: str, share: float, group: int, seed: int, near: int = 0, alone: bool = False,
+    first: str = 'right',
+):  # fmt: skip
     """
     Return a graph of the papers with false closures, and how many of its closures are right.
 
     :param group: successive nodes of false closures with one motion.
     :param near: nodes that their ends are apart at most; 0 = any.
     :param alone: without the right ones.
+    :param first: whether the right or the false ones are first in the file.
     """
     edges = read_edges(str(folder / f'pose_graphs/{name}.g2o'))
     right = [edge for edge in edges if edge[1] != edge[0] + 1]
@@ -267,7 +269,7 @@ def with_false(
             false += [(i + k, j + k, motion, information) for k in made]
     if alone:
         edges, right = [edge for edge in edges if edge[1] == edge[0] + 1], []
-    return graph_of([*edges, *false]), len(right)
+    return graph_of([*edges, *false] if first == 'right' else [*false, *edges]), len(right)
 
 
 def keep(blocks, inliers, values):
@@ -280,9 +282,10 @@ CASES = {  # of a rule: a graph that is wrong without it, and what replaces the 
     'rejected ones that may agree by now': ('MIT', 0.3, 1, 2, 0, blocks, 'PASSES', (False,)),
     'improbable ones go': ('smallGrid3D', 0.5, 10, 1, 0, Blocks, '_drop_improbable', keep),
     'weak ones that leave for others': ('MIT', 0.1, 10, 0, 0, Blocks, '_swap_weak', keep),
-    'one of ten nodes shows the factor': (
-        'MIT', 0.5, 10, 1, 40, Blocks, '_one_per_run', lambda blocks, numbers: numbers,
+    'closures of ten nodes count as one': (
+        'MIT', 0.5, 10, 1, 40, blocks, 'weights_in_runs', lambda runs: np.ones(len(runs)),
     ),
+    'certain together': ('MIT', 0.5, 1, 0, 0, blocks, 'are_certain', lambda odds, runs: False),
     'blocks by time': ('MIT', 0.5, 1, 0, 0, tuning, 'BLOCKS', 1),
     'four times the limit': ('parking-garage', 0.1, 1, 0, 0, tuning, 'TAILS', 1.0),
     'the factor on all errors': ('intel', 0.5, 10, 0, 0, tuning, 'FACTORS', np.ones(1)),
@@ -316,3 +319,15 @@ def test_false_closures_nearby_do_not_show_large_errors(data_folder, share, seed
     graph, _ = with_false(data_folder, 'intel', share, 10, seed, near=40, alone=True)
     graph.update(final=True)
     assert graph.accepted < 0.05 * graph.rejected
+
+
+@pytest.mark.parametrize('name', ['MIT', 'smallGrid3D', 'intel'])
+def test_order_of_the_closures_in_a_file_changes_nothing(data_folder, name):
+    """False closures behind the right ones of a file, as tools append them, show no more."""
+    accepted = []
+    for first in ('right', 'false'):
+        graph, right = with_false(data_folder, name, 0.5, 1, 0, first=first)
+        graph.update(final=True)
+        results = np.array([edge.accepted for edge in graph.edges])
+        accepted.append(results if first == 'right' else np.roll(results, right))
+    np.testing.assert_array_equal(*accepted)

@@ -55,17 +55,23 @@ class Beliefs:
         """Return the logarithm of the odds that closures are right, by their innovations."""
         return self.prior + self.space + likelihoods(rows)
 
-    def search_factor(self, rows: np.ndarray, factors: np.ndarray) -> 'Beliefs':
-        """Return these with the best factor on all errors, in parts of the last one."""
+    def search_factor(self, rows: np.ndarray, runs: np.ndarray, factors: np.ndarray) -> 'Beliefs':
+        """
+        Return these with the best factor on all errors, in parts of the last one.
+
+        :param rows: innovations of closures.
+        :param runs: numbers of their runs of nodes; those of a run count as one.
+        """
+        weights = weights_in_runs(runs)
         factors = np.array([1.0, *factors])
         densities = np.array([likelihoods(scale_errors(rows, factor)) for factor in factors])
         ratio, prior = np.exp((densities + self.space).clip(-50, 50)), np.array([[0.5]])
         for _ in range(tuning.MAX_STEPS):  # the part of the closures that are right
             right = prior * ratio / (prior * ratio + 1 - prior)
-            prior = (right.sum(axis=1, keepdims=True) + 1) / (ratio.shape[1] + 2)
-        evidence = np.log(prior * ratio + 1 - prior).sum(axis=1)
+            prior = ((right @ weights)[:, None] + 1) / (weights.sum() + 2)
+        evidence = np.log(prior * ratio + 1 - prior) @ weights
         # many false ones nearby fit large errors without being certain, and one fits by chance
-        is_certain = evidence >= tuning.CERTAIN * right.sum(axis=1).clip(tuning.JOINS)
+        is_certain = evidence >= tuning.CERTAIN * (right @ weights).clip(tuning.JOINS)
         evidence[1:] = np.where(is_certain, evidence - tuning.LOOSER, -np.inf)[1:]
         best = int(np.argmax(evidence))
         return replace(
@@ -80,6 +86,17 @@ class MeasuredSolution(Solution):
     """The nodes of a graph of another program, and the evidence on its closures."""
 
     beliefs: Beliefs
+
+
+def weights_in_runs(runs: np.ndarray) -> np.ndarray:
+    """Return weights of closures by which those of a run of nodes count as one, (n,)."""
+    numbers = np.unique(runs, return_inverse=True)[1]
+    return np.asarray(1 / np.bincount(numbers)[numbers])
+
+
+def are_certain(odds: np.ndarray, runs: np.ndarray) -> bool:
+    """Return whether closures are certain together, those of a run as one, by their odds."""
+    return bool(weights_in_runs(runs) @ odds > tuning.CERTAIN)
 
 
 def decide_in_blocks(
@@ -107,6 +124,7 @@ class _Blocks:
     ) -> None:
         self._chain, self._closures, self._placement = chain, closures, placement
         self._latest = np.maximum(closures.query, closures.place)
+        self._runs = self._latest // tuning.LONGEST  # whose closures may be wrong together
         count, old, self._nodes = len(closures), len(last.accepted), last.nodes
         self._is_old = np.arange(count) < old
         self._accepted = np.zeros(count, bool)
@@ -118,26 +136,20 @@ class _Blocks:
         self._beliefs = beliefs.resize(network.room, count)
         self._searches = count > 0 and count >= tuning.SEARCH * beliefs.search_count
         if self._searches:
-            sample = self._one_per_run(np.arange(count))
-            ends = chain.session[closures.query[sample]], chain.session[closures.place[sample]]
-            sample = sample[ends[0] == ends[1]]
+            ends = chain.session[closures.query], chain.session[closures.place]
+            inside = np.flatnonzero(ends[0] == ends[1])
             self._set_odometry()
             network.residuals(self._odometry, network.values(placement.initial))
-            rows, new = network.beside_odometry(sample), ~self._is_old[sample]
-            self._beliefs.innovations[sample[new]] = rows[new]
+            rows, new = network.beside_odometry(inside), ~self._is_old[inside]
+            self._beliefs.innovations[inside[new]] = rows[new]
             factors = tuning.FACTORS / self._beliefs.factor
-            self._beliefs = self._beliefs.search_factor(rows, factors)
+            self._beliefs = self._beliefs.search_factor(rows, self._runs[inside], factors)
             self._beliefs = replace(self._beliefs, search_count=count)
 
     def _set_odometry(self) -> None:
         """Set the information of all factors of the network at the present errors."""
         factor = self._beliefs.factor
         self._odometry = self._network.odometry(np.full(len(self._chain), factor), factor)
-
-    def _one_per_run(self, numbers: np.ndarray) -> np.ndarray:
-        """Return closures of which neighboring nodes have one: groups may be wrong together."""
-        runs = self._latest[numbers] // tuning.LONGEST
-        return np.asarray(numbers[np.unique(runs, return_index=True)[1]])
 
     def solution(self) -> MeasuredSolution:
         """Return the solution with all closures."""
@@ -180,12 +192,17 @@ class _Blocks:
             self._beliefs.innovations[own] = rows
             if self._searches:
                 rows, factors = self._beliefs.innovations, tuning.FACTORS[tuning.FACTORS < 1]
-                sample = self._one_per_run(np.flatnonzero(np.isfinite(rows[:, -1])))
-                self._beliefs = self._beliefs.search_factor(rows[sample], 1 / factors)
+                compared, factors = np.isfinite(rows[:, -1]), 1 / factors
+                self._beliefs = self._beliefs.search_factor(
+                    rows[compared], self._runs[compared], factors
+                )
                 self._set_odometry()
                 rows = self._beliefs.innovations[own]
-            passes = (squares(rows) <= limit) & (self._beliefs.odds(rows) > tuning.CERTAIN)
-            passes = new & (passes | network.new_joins(accepted))
+            odds, fits = self._beliefs.odds(rows), new & (squares(rows) <= limit)
+            likely = np.flatnonzero(fits & (odds > 0))
+            together = again and are_certain(odds[likely], self._runs[own[likely]])
+            passes = fits & (odds > (0 if together else tuning.CERTAIN))
+            passes |= new & network.new_joins(accepted)
             if not passes.any():
                 continue
             inliers, values = self._drop_improbable(*self._fit(accepted | passes, values))
@@ -199,10 +216,9 @@ class _Blocks:
     def _fit(self, chosen: np.ndarray, values: np.ndarray) -> Inliers:
         """Solve for closures, without those that contradict others."""
         network, odometry = self._network, self._odometry
-        values, _ = network.fit(odometry, chosen, values)
+        values, _ = network.fit(odometry, chosen, values, tuning.FIRST_STEPS)
         inliers = chosen & (network.residuals(odometry, values) <= network.limit)
-        if (inliers != chosen).any():
-            values, _ = network.fit(odometry, inliers, values)
+        values, _ = network.fit(odometry, inliers, values)
         return inliers, values
 
     def _drop_improbable(self, inliers: np.ndarray, values: np.ndarray) -> Inliers:

@@ -199,17 +199,22 @@ class Network:
         return weights > 0.5, values
 
     def fit(
-        self, odometry: np.ndarray, counted: np.ndarray, values: np.ndarray
+        self,
+        odometry: np.ndarray,
+        counted: np.ndarray,
+        values: np.ndarray,
+        steps: int = tuning.MAX_STEPS,
     ) -> tuple[np.ndarray, float]:
         """
         Estimate the variables by least squares, and return them and the evidence.
 
         :param counted: closures that count, shape (n,), bool.
+        :param steps: of Gauss and Newton, at most.
         :raises LinAlgError: no solution.
         """
         whole = np.concatenate([np.ones(len(values), bool), counted])
         error = float(self._solver.linearize(values, odometry)[whole].sum())
-        for _ in range(tuning.MAX_STEPS):
+        for _ in range(steps):
             values, determinant = self._step(values, counted * 1.0)
             before, error = error, float(self._solver.linearize(values, odometry)[whole].sum())
             if abs(before - error) < 2 * tuning.CONVERGED:
