@@ -30,7 +30,7 @@ from robot import LATCHED
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap
+from stavpr_ros.mapping import GrowingMap, save_map
 from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.method import Match, Status
 from stavpr_ros.method import match as match_module
@@ -519,6 +519,16 @@ def test_configuration_that_fails_leaves_no_thread(make_node, hide_module, param
     assert problem in node.problem
     assert node.state == 'unconfigured'
     assert set(threading.enumerate()) <= before
+
+
+@pytest.mark.parametrize('parameter', [('publish_initialpose', True), ('relative_pose', 'pnp')])
+def test_map_without_poses_is_refused_where_they_are_required(
+    make_node, small_map, tmp_path, parameter
+):
+    save_map(replace(small_map, poses=None), tmp_path / 'map')
+    node = make_node(map_path=str(tmp_path / 'map'), **dict([parameter]))
+    assert node.trigger_configure() == TransitionCallbackReturn.ERROR
+    assert re.search(f'{parameter[0]}.* requires poses', node.problem)
 
 
 def test_example_of_bridges_publishes_a_pose_at_the_start_and_on_each_request(robot, start, route):

@@ -55,7 +55,8 @@ class Navigation(Publishers):
         if settings.publish_initialpose:
             self._initial_pose = self._make(PoseWithCovarianceStamped, 'initialpose')
         self._places: Map | None = None
-        self.reset()
+        self._is_due, self._unmatched = True, 0  # the initial pose; images since the last match
+        self._matched: Outcome | None = None  # the newest keyframe, where its pose is known
 
     @property
     def sends_transform(self) -> bool:
@@ -122,9 +123,7 @@ class Navigation(Publishers):
 
     def reset(self) -> None:
         """Let the next match be the first one: the window was emptied."""
-        self._is_due = True  # the initial pose
-        self._unmatched = 0  # images since the last match
-        self._matched: Outcome | None = None  # the newest keyframe, where its pose is known
+        self._is_due, self._unmatched, self._matched = True, 0, None
 
     def close(self) -> None:
         """End the thread, destroy the publishers, and release the map."""
