@@ -245,7 +245,7 @@ class Runtime:
         self.worker.run(change)
 
     def _use_map(self, loaded: LoadedMap) -> None:
-        # without thumbnails less is checked, which diagnostics state; without poses nothing is sent
+        # diagnostics warn of missing thumbnails: less is checked; without poses, nothing is sent
         if unmet := self.settings.unmet(loaded.places.has_poses, has_thumbnails=True):
             raise SettingsError(unmet)
         self._change(loaded=loaded)
