@@ -3,13 +3,14 @@
 """A kind of features of another package: a plain dataclass and a class with feature_maps."""
 
 from dataclasses import dataclass, field, make_dataclass
+import re
 
 import cv2
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
-from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import registry
+from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.features import FeatureExtractor, registry
 from stavpr_ros.mapping import load_map, Map
 from stavpr_ros.mapping.map_schema import identity_fields
 
@@ -55,6 +56,63 @@ def test_kind_of_a_plain_dataclass_makes_a_map_and_has_options(tmp_path, capsys)
     with pytest.raises(SystemExit):
         build_map.main(['--help-features'])
     assert '--plain-weights' in capsys.readouterr().out
+
+
+class Vector(Plain):
+    """One vector an image."""
+
+    def feature_maps(self, images):
+        return super().feature_maps(images).reshape(len(images), -1)
+
+
+class Bare:
+    """No backbone."""
+
+    def __init__(self, settings, *extra) -> None:
+        """Take one argument, or more."""
+
+
+class Narrow(Bare):
+    """Called with the settings alone."""
+
+    def __init__(self, settings) -> None:
+        super().__init__(settings)
+
+
+def test_kind_of_one_vector_has_one_strip(monkeypatch, route):
+    kind = registry.Kind(PlainSettings, f'{__name__}:Vector')
+    monkeypatch.setitem(registry.KINDS, 'plain', kind)
+    place_map = Map.from_images(route[:3], 'plain')
+    assert place_map.features.strips.shape == (1, 3, 28 * 28)
+    with pytest.raises(SettingsError, match='leave both out'):
+        FeatureExtractor('plain', strips=7).extract(route[:1])
+
+
+@pytest.mark.parametrize(
+    ('name', 'lack'),
+    [('Bare', 'lacks settings, feature_maps'), ('Narrow', r'lacks the arguments \(settings, dev')],
+)
+def test_class_that_is_no_backbone_is_named(monkeypatch, name, lack):
+    kind = registry.Kind(PlainSettings, f'{__name__}:{name}')
+    monkeypatch.setitem(registry.KINDS, 'plain', kind)
+    with pytest.raises(SettingsError, match=f'{name} of features plain {lack}'):
+        FeatureExtractor('plain')
+
+
+def test_sound_map_of_another_package_or_version_is_not_called_damaged(
+    monkeypatch, route, tmp_path
+):
+    Map.from_images(route[:3], 'plain').save(path := tmp_path / 'map')
+    older = make_dataclass('Settings', [('side', int, 28)], frozen=True)
+    for kind, reason in (
+        ({'plain': registry.Kind(older, f'{__name__}:Plain')}, "have the unknown 'weights'"),
+        ({}, "features 'plain' are unknown: install the package"),
+    ):
+        monkeypatch.delitem(registry.KINDS, 'plain')
+        registry.KINDS.update(kind)
+        with pytest.raises(MapFileError, match=f'{reason}.*install or update') as caught:
+            load_map(path)
+        assert not re.search('damaged|backup', str(caught.value))
 
 
 def test_setting_of_a_type_that_map_files_lack_is_named(monkeypatch):
