@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
-from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.errors import JournalError, MapFileError, SettingsError
 from stavpr_ros.features import FeatureExtractor, registry
 from stavpr_ros.mapping import load_map, Map
+from stavpr_ros.mapping.journal import Base, JournalReader
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.map_schema import identity_fields
 
 
@@ -65,18 +67,8 @@ class Vector(Plain):
         return super().feature_maps(images).reshape(len(images), -1)
 
 
-class Bare:
-    """No backbone."""
-
-    def __init__(self, settings, *extra) -> None:
-        """Take one argument, or more."""
-
-
-class Narrow(Bare):
-    """Called with the settings alone."""
-
-    def __init__(self, settings) -> None:
-        super().__init__(settings)
+Bare = type('Bare', (), {'__init__': lambda self, settings, device: None})
+Narrow = type('Narrow', (), {'__init__': lambda self, settings: None})
 
 
 def test_kind_of_one_vector_has_one_strip(monkeypatch, route):
@@ -102,7 +94,8 @@ def test_class_that_is_no_backbone_is_named(monkeypatch, name, lack):
 def test_sound_map_of_another_package_or_version_is_not_called_damaged(
     monkeypatch, route, tmp_path
 ):
-    Map.from_images(route[:3], 'plain').save(path := tmp_path / 'map')
+    (place_map := Map.from_images(route[:3], 'plain')).save(path := tmp_path / 'map')
+    (journal := JournalWriter.create(path, Base(), place_map, print)).close()
     older = make_dataclass('Settings', [('side', int, 28)], frozen=True)
     for kind, reason in (
         ({'plain': registry.Kind(older, f'{__name__}:Plain')}, "have the unknown 'weights'"),
@@ -113,6 +106,8 @@ def test_sound_map_of_another_package_or_version_is_not_called_damaged(
         with pytest.raises(MapFileError, match=f'{reason}.*install or update') as caught:
             load_map(path)
         assert not re.search('damaged|backup', str(caught.value))
+        with pytest.raises(JournalError, match=f'^map .*{reason}.*update it$'):
+            JournalReader(journal.path)
 
 
 def test_setting_of_a_type_that_map_files_lack_is_named(monkeypatch):

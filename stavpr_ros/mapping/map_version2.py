@@ -8,7 +8,7 @@ import json
 from typing import Any, IO
 
 import numpy as np
-from stavpr_ros.errors import MapFileError, UnavailableError
+from stavpr_ros.errors import MapFileError, UnavailableError, UnfitMapError
 from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, PIECE, read_json
 from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, text
 
@@ -48,7 +48,7 @@ def read_header(file: MapFile) -> None:
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise file.foreign_error(f'no manifest in its header, {error}') from error
     if version != str(VERSION):
-        raise MapFileError(
+        raise UnfitMapError(
             f'{file.path} has format version {str(version)[:20]}, this program reads {VERSION}: '
             'update it'
         )
