@@ -94,6 +94,10 @@ class MapFileError(StavprError):
     """A map file is damaged, truncated, foreign or too new to be read."""
 
 
+class UnfitMapError(MapFileError):
+    """A sound map requires another version of this program, or a package that is not installed."""
+
+
 class JournalError(StavprError):
     """The journal of a recorded map cannot be read, or is in use."""
 

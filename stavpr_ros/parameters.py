@@ -371,8 +371,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'publish_initialpose',
             False,
             'localization: publishes initialpose (x, y, yaw) for Nav2 at the first match after '
-            'the start, a reset or sequence_length images without a match. Requires a map with '
-            'poses.',
+            'the start, a reset or sequence_length images without a match, when it has a '
+            'subscriber. Requires a map with poses.',
         ),
         NodeParameter(
             'localized_probability',

@@ -131,7 +131,10 @@ CASES = {
     ],
     'map': [
         (OK, '1000 places of route.map', {}),
-        (OK, 'without thumbnails, so that geometric_check checks no', {'geometric_check': 'orb'}),
+        (WARN, 'geometric_check requires thumbnails', {'geometric_check': 'orb'}),
+        (WARN, 'pnp requires poses, relative_pose pnp requires', {'relative_pose': 'pnp'}),
+        (WARN, 'publish_tf requires poses; record', {'publish_tf': True}),
+        (OK, 'places of', {'relative_pose': 'pnp', 'operation': 'loop_closure'}),
         (WARN, 'defect; the map in use has 1000 places', {'problem': 'defect'}),
         (ERROR, 'defect', NO_MAP | {'problem': 'defect'}),
         (WARN, 'no map is loaded: set map_path, or call ~/load_map', NO_MAP),

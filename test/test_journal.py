@@ -326,7 +326,7 @@ def header_with(**changes):
         (header_with(path=7), 'another format'),
         (header_with(places='9'), 'another format'),
         (header_with(version=1), 'another format'),
-        (header_with(), 'damaged or truncated'),  # and no map
+        (header_with(), 'is no map, or a damaged one'),  # and no map
     ],
 )
 def test_file_with_an_invalid_header_stops_no_start_and_is_kept(content, text, target):

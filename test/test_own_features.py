@@ -3,14 +3,17 @@
 """A kind of features of another package: a plain dataclass and a class with feature_maps."""
 
 from dataclasses import dataclass, field, make_dataclass
+import re
 
 import cv2
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
-from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import registry
+from stavpr_ros.errors import JournalError, MapFileError, SettingsError
+from stavpr_ros.features import FeatureExtractor, registry
 from stavpr_ros.mapping import load_map, Map
+from stavpr_ros.mapping.journal import Base, JournalReader
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.map_schema import identity_fields
 
 
@@ -55,6 +58,56 @@ def test_kind_of_a_plain_dataclass_makes_a_map_and_has_options(tmp_path, capsys)
     with pytest.raises(SystemExit):
         build_map.main(['--help-features'])
     assert '--plain-weights' in capsys.readouterr().out
+
+
+class Vector(Plain):
+    """One vector an image."""
+
+    def feature_maps(self, images):
+        return super().feature_maps(images).reshape(len(images), -1)
+
+
+Bare = type('Bare', (), {'__init__': lambda self, settings, device: None})
+Narrow = type('Narrow', (), {'__init__': lambda self, settings: None})
+
+
+def test_kind_of_one_vector_has_one_strip(monkeypatch, route):
+    kind = registry.Kind(PlainSettings, f'{__name__}:Vector')
+    monkeypatch.setitem(registry.KINDS, 'plain', kind)
+    place_map = Map.from_images(route[:3], 'plain')
+    assert place_map.features.strips.shape == (1, 3, 28 * 28)
+    with pytest.raises(SettingsError, match='leave both out'):
+        FeatureExtractor('plain', strips=7).extract(route[:1])
+
+
+@pytest.mark.parametrize(
+    ('name', 'lack'),
+    [('Bare', 'lacks settings, feature_maps'), ('Narrow', r'lacks the arguments \(settings, dev')],
+)
+def test_class_that_is_no_backbone_is_named(monkeypatch, name, lack):
+    kind = registry.Kind(PlainSettings, f'{__name__}:{name}')
+    monkeypatch.setitem(registry.KINDS, 'plain', kind)
+    with pytest.raises(SettingsError, match=f'{name} of features plain {lack}'):
+        FeatureExtractor('plain')
+
+
+def test_sound_map_of_another_package_or_version_is_not_called_damaged(
+    monkeypatch, route, tmp_path
+):
+    (place_map := Map.from_images(route[:3], 'plain')).save(path := tmp_path / 'map')
+    (journal := JournalWriter.create(path, Base(), place_map, print)).close()
+    older = make_dataclass('Settings', [('side', int, 28)], frozen=True)
+    for kind, reason in (
+        ({'plain': registry.Kind(older, f'{__name__}:Plain')}, "have the unknown 'weights'"),
+        ({}, "features 'plain' are unknown: install the package"),
+    ):
+        monkeypatch.delitem(registry.KINDS, 'plain')
+        registry.KINDS.update(kind)
+        with pytest.raises(MapFileError, match=f'{reason}.*install or update') as caught:
+            load_map(path)
+        assert not re.search('damaged|backup', str(caught.value))
+        with pytest.raises(JournalError, match=f'^map .*{reason}.*update it$'):
+            JournalReader(journal.path)
 
 
 def test_setting_of_a_type_that_map_files_lack_is_named(monkeypatch):

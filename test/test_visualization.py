@@ -30,11 +30,12 @@ from robot import LATCHED
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap
+from stavpr_ros.mapping import GrowingMap, save_map
 from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.method import Match, Status
 from stavpr_ros.method import match as match_module
 from stavpr_ros.pipeline import ImageResult
+from stavpr_ros.pipeline.operations import NOT_A_KEYFRAME
 from stavpr_ros.pipeline.overlay import draw_match, draw_window
 from stavpr_ros.ros.messages import matched_pose_message, Outcome, pose_message, Surroundings
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
@@ -371,7 +372,7 @@ def publishing(map_file, monkeypatch):
         publish_tf=True, publish_initialpose=True, map_frame='map', pipeline=pipeline.settings,
         transform_tolerance=0.25,
     )  # fmt: skip
-    publishers = Publishers(())
+    publishers = Publishers({'initialpose'})
     publishers.get_clock = lambda: SimpleNamespace(now=lambda: RclTime(seconds=clock.time))
     navigation = Navigation(publishers, settings)
 
@@ -390,6 +391,7 @@ def publishing(map_file, monkeypatch):
         show=show, pipeline=pipeline, navigation=navigation, clock=clock, beats=beats,
         tf=publishers.by_topic['/tf'].messages,
         initial=publishers.by_topic['initialpose'].messages,
+        subscriber=publishers.by_topic['initialpose'],
     )  # fmt: skip
 
 
@@ -437,9 +439,61 @@ def test_initial_pose_is_published_once_for_each_relocalization(publishing, rout
     assert pose.header.stamp.sec == first + 1
     assert pose.pose.pose.position.x == pytest.approx(first, abs=1)
     publishing.pipeline.operation.reset()  # a new window
+    publishing.navigation.reset()
     assert publishing.show(route[30:45], 30)[:: LENGTH - 1][:2] == [False, True]
     assert len(publishing.initial) == 2
     assert publishing.initial[-1].header.stamp.sec > 30
+
+
+W, N, M, X, S = 'warming up', 'no match', 'match', 'no pose', 'skipped'
+
+
+def publish_statuses(publishing, statuses, first=0):
+    """Publish an image of each status at the place of its number."""
+    places = publishing.pipeline.places
+    for i, status in enumerate(statuses, first):
+        code = {W: Status.WARMING_UP, N: Status.NO_MATCH, M: Status.MATCH, X: Status.MATCH}
+        cause = '' if status in code else NOT_A_KEYFRAME if status == S else status
+        path = match_module.Path(np.array([[LENGTH - 1, i]]), i)
+        result = ImageResult(Match(code.get(status, Status.SKIPPED), path=path), cause)
+        publishing.navigation.publish(Outcome(header(i), result, places, ABOUT))
+    return [pose.header.stamp.sec - 1 for pose in publishing.initial]
+
+
+@pytest.mark.parametrize(
+    ('statuses', 'sent'),
+    [
+        ([W, W, M, W, W, M], [2]),  # two early matches of one start
+        ([W, M, N, M, 'no odometry', S, M, *[N] * (LENGTH - 2), M], [1]),
+        ([M, *[N] * (LENGTH - 1), M], [0, LENGTH]),
+        ([M, *[W] * (LENGTH - 1), M], [0, LENGTH]),
+        ([X, X, M, M], [2]),  # the first places have no pose
+    ],
+)
+def test_statuses_between_two_matches_are_no_relocalization(publishing, statuses, sent):
+    publishing.pipeline.places.poses[[i for i, s in enumerate(statuses) if s == X]] = np.nan
+    assert publish_statuses(publishing, statuses) == sent
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'sent'),
+    [
+        ([M], [M, M], [1]),
+        ([M, M], [S, S, M], [1]),  # of a robot that has stopped
+        ([M], [N, N, M], [3]),
+        ([M], ['no odometry', S, M], [3]),  # it may have moved
+        ([], [W, M], [1]),
+    ],
+)
+def test_initial_pose_waits_for_a_subscriber(publishing, before, after, sent):
+    publishing.subscriber.is_requested = False
+    assert not publish_statuses(publishing, before)
+    publishing.subscriber.is_requested = True
+    assert publish_statuses(publishing, after, len(before)) == sent
+    publishing.subscriber.is_requested = False  # another AMCL takes its place
+    publish_statuses(publishing, [S], 10)
+    publishing.subscriber.is_requested = True
+    assert publish_statuses(publishing, [M, M], 11) == [*sent, 11]
 
 
 def test_navigation_on_a_growing_route_publishes_nothing(publishing, route):
@@ -465,6 +519,16 @@ def test_configuration_that_fails_leaves_no_thread(make_node, hide_module, param
     assert problem in node.problem
     assert node.state == 'unconfigured'
     assert set(threading.enumerate()) <= before
+
+
+@pytest.mark.parametrize('parameter', [('publish_initialpose', True), ('relative_pose', 'pnp')])
+def test_map_without_poses_is_refused_where_they_are_required(
+    make_node, small_map, tmp_path, parameter
+):
+    save_map(replace(small_map, poses=None), tmp_path / 'map')
+    node = make_node(map_path=str(tmp_path / 'map'), **dict([parameter]))
+    assert node.trigger_configure() == TransitionCallbackReturn.ERROR
+    assert re.search(f'{parameter[0]}.* requires poses', node.problem)
 
 
 def test_example_of_bridges_publishes_a_pose_at_the_start_and_on_each_request(robot, start, route):

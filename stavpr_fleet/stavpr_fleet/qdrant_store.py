@@ -27,6 +27,7 @@ from stavpr_ros.errors import (
     SettingsError,
     StavprError,
     UnavailableError,
+    UnfitMapError,
 )
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import load_map, Map, save_map, select_places, Session
@@ -348,6 +349,8 @@ def _foreign() -> Iterator[None]:
         yield
     except FleetError:
         raise
+    except UnfitMapError as error:
+        raise FleetError(str(error)) from error
     except Exception as error:
         text = str(error) if isinstance(error, StavprError) else repr(error)
         raise FleetError(f'its data is damaged, or of another program: {text}') from error

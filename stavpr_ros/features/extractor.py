@@ -25,8 +25,7 @@ from stavpr_ros.errors import (
 from stavpr_ros.features.efficientnet_lite_file import find_file
 from stavpr_ros.features.registry import (
     AUTO,
-    Backbone,
-    backbone_class,
+    make_backbone,
     NetworkSettings,
     settings_class,
 )
@@ -262,10 +261,10 @@ class FeatureExtractor:
             logging.getLogger(__name__).info('%s', self.choice)
         if backbone is None:
             backbone = settings_class(kind)()
-        self._backbone: Backbone = backbone_class(kind)(backbone, device)
+        self._backbone = make_backbone(kind, backbone, device)
         self.projection: Projection | None = None
         test_maps = None
-        if isinstance(backbone, NetworkSettings) or isinstance(projection, int):
+        if strips is None or isinstance(backbone, NetworkSettings) or isinstance(projection, int):
             image = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
             test_maps = self._backbone.feature_maps([image])
             if not np.isfinite(test_maps).all():
@@ -371,11 +370,12 @@ class FeatureExtractor:
             if W != 1 or pooling != 'flatten':
                 raise SettingsError(
                     f'features {self.settings.kind} are one vector of {maps.shape[1]} numbers an '
-                    f'image: expected W = 1 strip and pooling flatten, not {W} and {pooling}'
+                    f'image: expected W = 1 strip and pooling flatten, not {W} and {pooling}; '
+                    'leave both out (--strips)'
                 )
             return np.asarray(maps, np.float32)[None], (1, 1)
-        cells = (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
-        return cut_strips(maps, W, pooling), cells
+        strips = cut_strips(maps, W, pooling)
+        return strips, (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
@@ -411,7 +411,8 @@ def cut_strips(feature_maps: np.ndarray, W: int, pooling: str = 'flatten') -> np
     n, channels, height, Wf = require_shape('feature maps', feature_maps, 'n C H Wf')
     if not 1 <= W <= Wf:
         raise InputError(
-            f'feature maps are Wf = {Wf} columns wide: they cannot be cut into W = {W} strips'
+            f'feature maps are Wf = {Wf} columns wide: they cannot be cut into W = {W} strips: '
+            'take fewer (--strips)'
         )
     width = Wf // W
     margin = (Wf % W) // 2

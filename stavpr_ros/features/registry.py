@@ -9,6 +9,7 @@ Imports neither NumPy nor OpenCV, so that parameters and command-line options lo
 from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
+import inspect
 import json
 from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
@@ -308,7 +309,7 @@ def _kind(name: str) -> Kind:
             'network, or leave the settings out'
         )
     if kind is None:
-        remedy = f'take one of {", ".join(kinds())}'
+        remedy = f'install the package that has them, or take one of {", ".join(kinds())}'
         if name in LAB:
             remedy = 'they are in the package stavpr_lab, which is not installed'
         raise SettingsError(f'features {name!r} are unknown: {remedy}')
@@ -329,6 +330,28 @@ def backbone_class(kind: str) -> Any:
             'map with the network itself'
         )
     return plugins.resolve(backbone)
+
+
+def make_backbone(kind: str, settings: Any, device: str) -> Backbone:
+    """
+    Make the object that computes the features of a kind.
+
+    :raises SettingsError: its class is no :class:`Backbone`.
+    """
+    cls = backbone_class(kind)
+    try:
+        inspect.signature(cls).bind(settings, device)
+    except TypeError as error:
+        lacking = [f'the arguments (settings, device) ({error})']
+    else:
+        backbone: Backbone = cls(settings, device)
+        lacking = [name for name in ('settings', 'feature_maps') if not hasattr(backbone, name)]
+    if lacking:
+        raise SettingsError(
+            f'{cls.__module__}.{cls.__qualname__} of features {kind} lacks {", ".join(lacking)}: '
+            'write it as stavpr_ros.features.registry.Backbone states'
+        )
+    return backbone
 
 
 def settings_from_json(kind: str, text: str, model: str = '') -> Any:

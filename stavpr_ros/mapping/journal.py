@@ -25,7 +25,7 @@ from typing import NamedTuple, Self
 import zlib
 
 import numpy as np
-from stavpr_ros.errors import JournalError, StavprError
+from stavpr_ros.errors import JournalError, StavprError, UnfitMapError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import errors_of, MapFile, read_json
 from stavpr_ros.mapping.map_content import require_jpegs, require_weights
@@ -229,6 +229,8 @@ class JournalReader:
             with io.FileIO(os.memfd_create('template'), 'r+b') as raw, errors_of(self.path):
                 raw.write(self.template_content)
                 self.template = in_memory(map_of(MapFile(raw, self.path)))
+        except UnfitMapError as error:
+            raise JournalError(str(error)) from error
         except (ValueError, OSError, StavprError) as error:
             raise JournalError(
                 f'{self.path} is no journal, or its header is damaged ({error}): move it elsewhere'

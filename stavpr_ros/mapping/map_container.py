@@ -20,7 +20,7 @@ from typing import Any
 import weakref
 
 import numpy as np
-from stavpr_ros.errors import MapFileError
+from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError, UnfitMapError
 from stavpr_ros.memory import aligned_empty
 
 # Name of a type in safetensors files: its NumPy type; BF16 is only passed on.
@@ -190,9 +190,13 @@ def errors_of(path: Path) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         raise MapFileError(f'map {path} does not exist: make one with build_map') from error
-    except OSError as error:
-        raise MapFileError(
-            f'map {path} cannot be read ({error.strerror}): name a map file'
+    except (OSError, MemoryError) as error:
+        reason = getattr(error, 'strerror', None) or 'not enough memory'
+        raise MapFileError(f'map {path} cannot be read ({reason}): name a map file') from error
+    except (SettingsError, UnavailableError) as error:  # the manifest is as it was written
+        raise UnfitMapError(
+            f'map {path} is of another version, or requires another package ({error}): install or '
+            'update it'
         ) from error
     except Exception as error:
         raise MapFileError(

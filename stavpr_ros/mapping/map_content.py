@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from stavpr_ros.errors import InputError, printable
+from stavpr_ros.errors import InputError, printable, SettingsError
 from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import make_settings, settings_class
 from stavpr_ros.mapping.camera import Camera
@@ -172,6 +172,8 @@ def _settings(content: dict[str, Any]) -> FeatureSettings:
     values = getattr(settings_class(kind), 'BEFORE', {}) | content['backbone']
     for name in getattr(settings_class(kind), 'DROPPED', ()):
         values.pop(name, None)
+    if unknown := values.keys() - rows.keys():
+        raise SettingsError(f'settings of features {kind} have the unknown {min(unknown)!r}')
     record(rows)(values, f'settings of features {kind}')
     if 'sha256' in rows and not values['sha256']:
         raise ValueError(f'settings of features {kind} lack the sha256 of the model')

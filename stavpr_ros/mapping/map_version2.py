@@ -8,7 +8,7 @@ import json
 from typing import Any, IO
 
 import numpy as np
-from stavpr_ros.errors import MapFileError
+from stavpr_ros.errors import MapFileError, UnavailableError, UnfitMapError
 from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, PIECE, read_json
 from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, text
 
@@ -48,7 +48,7 @@ def read_header(file: MapFile) -> None:
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise file.foreign_error(f'no manifest in its header, {error}') from error
     if version != str(VERSION):
-        raise MapFileError(
+        raise UnfitMapError(
             f'{file.path} has format version {str(version)[:20]}, this program reads {VERSION}: '
             'update it'
         )
@@ -63,9 +63,9 @@ def read_header(file: MapFile) -> None:
     file.parts = _parts(header, file.manifest['parts'], 8 + length, file.size)
     for name, section in file.manifest['sections'].items():
         if section['required'] and section['version'] > KNOWN_SECTIONS.get(name, 0):
-            raise ValueError(
+            raise UnavailableError(
                 f'it requires section {name}, version {section["version"]}, which this program '
-                'does not know: update it'
+                'does not know'
             )
 
 

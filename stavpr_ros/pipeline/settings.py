@@ -186,6 +186,21 @@ class NodeSettings:
         used = self.pipeline.keyframes.needs_poses or self.publish_tf
         return used or self.operation != 'localization'
 
+    def unmet(self, has_poses: bool, has_thumbnails: bool) -> str:
+        """Return which parameters require of a map in localization what it lacks, '' = none."""
+        rows = (
+            ('publish_tf', self.publish_tf, 'poses', has_poses),
+            ('publish_initialpose', self.publish_initialpose, 'poses', has_poses),
+            ('relative_pose pnp', self.relative_pose == 'pnp', 'poses', has_poses),
+            ('relative_pose pnp', self.relative_pose == 'pnp', 'thumbnails', has_thumbnails),
+            ('geometric_check', self.pipeline.geometric is not None, 'thumbnails', has_thumbnails),
+        )
+        unmet = [f'{name} requires {what}' for name, is_set, what, has in rows if is_set > has]
+        if not unmet or self.operation != 'localization':
+            return ''
+        remedy = 'record it with odometry on odom and a thumbnail_width, or leave these out'
+        return f'the map does not fit: {", ".join(unmet)}; {remedy}'
+
 
 def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     """

@@ -176,9 +176,9 @@ def _map_finding(health: Health) -> Finding:
     if info.state == 'full':
         remedy = 'save it with ~/save_map, then raise max_places'
         return warning, f'full: mapping stopped at {places} (max_places); {remedy}'
-    if settings.geometric and not info.has_thumbnails:
-        places += ' without thumbnails, so that geometric_check checks no match,'
-    return OK, f'{places} of {health.map_path or "a map without a file"}'
+    text = f'{places} of {health.map_path or "a map without a file"}'
+    unmet = health.settings.unmet(info.has_poses, info.has_thumbnails)
+    return (warning, f'{text}: {unmet}') if unmet else (OK, text)
 
 
 def _recognition_finding(health: Health) -> Finding:

@@ -13,8 +13,8 @@ from rclpy.node import Node
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.method import Status
 from stavpr_ros.pipeline import NodeSettings
+from stavpr_ros.pipeline.operations import NOT_A_KEYFRAME
 from stavpr_ros.ros.messages import matched_pose_message, Outcome, transform_message
 from stavpr_ros.ros.output import Publishers
 from stavpr_ros.ros.worker import Beat
@@ -32,7 +32,8 @@ class Navigation(Publishers):
 
     The transform is of the last match. It is repeated on a thread of its own and stamped
     ``transform_tolerance`` later than now, so that a transform at the present time is known: tf2
-    does not extrapolate. Nothing is sent before the first match.
+    does not extrapolate. Nothing is sent before the first match. The initial pose waits for a
+    subscriber while the newest keyframe matches, and is due again when the last one has gone.
 
     :raises UnavailableError: ``publish_tf`` is set and tf2_msgs is not installed.
     """
@@ -53,8 +54,9 @@ class Navigation(Publishers):
             self._beat = Beat(node, TF_PERIOD, self.repeat, 'tf')
         if settings.publish_initialpose:
             self._initial_pose = self._make(PoseWithCovarianceStamped, 'initialpose')
-        self._unmatched = settings.pipeline.sequence.length  # images since the last match
         self._places: Map | None = None
+        self._is_due, self._unmatched = True, 0  # the initial pose; images since the last match
+        self._matched: Outcome | None = None  # the newest keyframe, where its pose is known
 
     @property
     def sends_transform(self) -> bool:
@@ -63,20 +65,23 @@ class Navigation(Publishers):
 
     def publish(self, outcome: Outcome) -> None:
         """Publish transform and initial pose, in operation localization."""
-        match, place_map = outcome.match, outcome.place_map
+        place_map = outcome.place_map
         if outcome.places is not self._places:
             self.forget()
             self._places = place_map
-        if outcome.result.cause or place_map is None:
-            return
-        # a whole window without a match, or a new window
-        length = self._settings.pipeline.sequence.length
-        is_lost = self._unmatched >= length - 1
-        if match.status is Status.WARMING_UP:
-            self._unmatched = length
-        else:
-            self._unmatched = 0 if match.accepted else self._unmatched + 1
+        if not outcome.result.cause and place_map is not None:
+            self._note(outcome)
+        elif outcome.result.cause != NOT_A_KEYFRAME:  # the robot may have moved meanwhile
+            self._matched = None
+        self._send_initial_pose()
+
+    def _note(self, outcome: Outcome) -> None:
+        """Take an image of the window, and send its transform."""
         pose, about = outcome.newest_pose, outcome.about
+        self._matched = None if pose is None else outcome
+        self._unmatched = 0 if outcome.match.accepted else self._unmatched + 1
+        # a whole window without a match
+        self._is_due |= self._unmatched >= self._settings.pipeline.sequence.length - 1
         if self._tf is not None and pose is not None and about.pose is not None:
             shift = map_to_odometry(pose, about.pose)
             transform = transform_message(shift, about.frame, about.odometry_frame)
@@ -85,10 +90,16 @@ class Navigation(Publishers):
                     self._send_transform(transform, outcome.header.stamp)
                 self._transform = transform
             self.repeat()
-        if self._initial_pose is None or not is_lost:
+
+    def _send_initial_pose(self) -> None:
+        """Send the pose of the newest keyframe where it is due, to a subscriber."""
+        if self._initial_pose is None:
             return
-        if (message := matched_pose_message(outcome)) is not None:
+        if not self._is_requested(self._initial_pose):
+            self._is_due = True
+        elif self._is_due and (message := self._matched and matched_pose_message(self._matched)):
             self._send(self._initial_pose, planar(message))
+            self._is_due = False
 
     def repeat(self) -> None:
         """Send the last transform, if any, for the time until the next one."""
@@ -107,13 +118,18 @@ class Navigation(Publishers):
         """Send no transform until the next match: another map, or the node is deactivated."""
         with self._lock:
             self._transform = None
-        self._places, self._unmatched = None, self._settings.pipeline.sequence.length
+        self._places = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Let the next match be the first one: the window was emptied."""
+        self._is_due, self._unmatched, self._matched = True, 0, None
 
     def close(self) -> None:
         """End the thread, destroy the publishers, and release the map."""
         if self._beat is not None:
             self._beat.stop()
-        self._places = None
+        self._places = self._matched = None
         super().close()
 
 

@@ -11,6 +11,7 @@ import traceback
 from typing import Any
 
 from stavpr_msgs.msg import MapInfo
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import GrowingMap
 from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
@@ -244,6 +245,9 @@ class Runtime:
         self.worker.run(change)
 
     def _use_map(self, loaded: LoadedMap) -> None:
+        # diagnostics warn of missing thumbnails: less is checked; without poses, nothing is sent
+        if unmet := self.settings.unmet(loaded.places.has_poses, has_thumbnails=True):
+            raise SettingsError(unmet)
         self._change(loaded=loaded)
         if self.intake.images is not None:
             self.intake.follow_odometry(self.settings, self.pipeline.places)

@@ -19,6 +19,7 @@ from processes import environment, executable, Process, SECOND, TIMEOUT
 import pytest
 from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
+from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.messages import nanoseconds
@@ -26,6 +27,7 @@ from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
+from stavpr_slam.ros.bridges.poses import RobotLocalizationBridge
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
 from test_pose_graph_node import Peer
@@ -106,6 +108,14 @@ def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, leve
     result, sentence = Bridge.status(bridge)
     assert result == level
     assert text in sentence
+
+
+def test_pose_of_a_relocalization_waits_for_a_subscriber():
+    counts = iter([0, 1, 1, 0, 1])
+    publisher = SimpleNamespace(get_subscription_count=lambda: next(counts))
+    bridge = SimpleNamespace(_last=-11 * SECOND, _gap=10 * SECOND, _publisher=publisher)
+    causes = [RobotLocalizationBridge.reason_to_skip(bridge, LoopClosure()) for _ in range(5)]
+    assert causes == ['without_subscriber', '', 'not_relocalized', 'without_subscriber', '']
 
 
 def test_pose_bridges_publish_pose_on_map(tmp_path):

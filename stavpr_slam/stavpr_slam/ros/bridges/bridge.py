@@ -25,6 +25,7 @@ REMEDIES = {
     'no_keyframe': 'no keyframe near the stamps of the images: is it the same clock and odometry?',
     'on_a_map': 'the places are of a map, not of this drive: use operation loop_closure',
     'not_on_a_map': 'the places are of this drive: use operation localization, a map with poses',
+    'without_subscriber': 'nobody subscribes to the pose: start the filter, set its topic',
     'not_pnp': 'the closures are not by PnP: set camera_info of the recognition node',
 }
 

@@ -67,7 +67,8 @@ class RobotLocalizationBridge(PoseBridge):
     """
     Publishes ``~/pose`` for a ``poseN`` of robot_localization, once per relocalization.
 
-    Errors of successive poses correlate, and a filter that fuses each of them becomes too certain.
+    It waits for a subscriber. Errors of successive poses correlate: a filter that fuses each of
+    them becomes too certain.
     """
 
     NAME, TOPIC = 'robot_localization', '~/pose'
@@ -88,5 +89,8 @@ class RobotLocalizationBridge(PoseBridge):
         """Return why all but the first closure after a gap are left out."""
         stamp = nanoseconds(message.relative_pose.query_stamp)
         is_new = not 0 <= stamp - self._last <= self._gap
+        if not self._publisher.get_subscription_count():  # a filter that starts later needs one
+            self._last = -self._gap - 1
+            return 'without_subscriber'
         self._last = stamp
         return '' if is_new else 'not_relocalized'
