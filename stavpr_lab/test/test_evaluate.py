@@ -3,6 +3,7 @@
 """The command evaluate on traverses and descriptors: numbers, exports, the page of its report."""
 
 import csv
+from dataclasses import replace
 from glob import glob
 import json
 import os
@@ -88,6 +89,21 @@ def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_pat
     assert same['settings']['odometry'] == str(paths['left'])
     other = numbers(*options, '--odometry', paths['right'])['decision']
     assert other['matched'] < plain['matched'] - 15
+
+
+def test_truth_of_one_session_counts_matches_of_every_session(folders, numbers, tmp_path):
+    extractor = FeatureExtractor('gradient')
+    maps = [build_map(open_source(folders / name), extractor) for name in ('map', 'shifted')]
+    same = np.tile(np.arange(PLACES, dtype=np.int32), 2)
+    save_map(replace(merge_maps(maps, 'ab'), same_as=same), tmp_path / 'both.stavpr')
+    (tmp_path / 'pairs.csv').write_text(''.join(f'{i},{i}\n' for i in range(0, PLACES, 5)))
+    options = '--truth', tmp_path / 'pairs.csv', '--tolerance', 2, '--output', tmp_path / 'report'
+    result = numbers('--map', tmp_path / 'both.stavpr', '--query', folders / 'shifted', *options)
+    assert (result['decision']['matched_with_truth'], result['places']) == (12, 2 * PLACES)
+    assert result['decision']['wrongly_matched'] == 0
+    rows = list(csv.DictReader((tmp_path / 'report' / 'answers.csv').open()))
+    assert {int(row['sequence_place']) // PLACES for row in rows} == {1}
+    assert [row['true_place'] for row in rows[5::5]] == [str(i) for i in range(5, PLACES, 5)]
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from stavpr_lab.evaluation.ground_truth_files import Names, read_pairs
 from stavpr_ros.checks import require_shape
@@ -188,12 +189,25 @@ class GroundTruth:
 
     @cached_property
     def middles(self) -> np.ndarray:
-        """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
+        """
+        Return the middle one of each query's accepted places, shape (N,), int64; -1 = none.
+
+        Of places that do not follow each other, as of several sessions, the first run counts.
+        """
         middles = np.full(self.N, -1, np.int64)
-        ends = np.cumsum(self._counts)
-        at = (2 * ends - self._counts - 1) // 2
-        middles[self.has_match] = self.keys[at[self.has_match]] % self.n
+        queries, firsts, lasts = self.runs
+        own, at = np.unique(queries, return_index=True)
+        middles[own] = (firsts[at] + lasts[at]) // 2
         return middles
+
+    @property
+    def runs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return query, first and last place of each run of accepted places, in order, (R,)."""
+        queries, places = self.pairs.T
+        is_first = np.diff(places, prepend=-2) != 1
+        is_first[1:] |= np.diff(queries) != 0
+        is_last = np.append(is_first, True)[1:]
+        return queries[is_first], places[is_first], places[is_last]
 
     @cached_property
     def _counts(self) -> np.ndarray:
@@ -225,10 +239,11 @@ class GroundTruth:
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return (self.keys[at] == keys) & (places >= 0)
 
-    def widened(self, tolerance: int) -> Self:
+    def widened(self, tolerance: int, sessions: np.ndarray | None = None) -> Self:
         """
         Accept ``tolerance`` places before and after each accepted one as well.
 
+        :param sessions: of each place, (n,); only places of the same one are accepted.
         :raises InputError: no whole number >= 0.
         """
         if not tolerance >= 0 or not float(tolerance).is_integer():
@@ -238,8 +253,22 @@ class GroundTruth:
         queries, places = self.pairs.T
         around = places[:, None] + np.arange(-int(tolerance), int(tolerance) + 1)
         inside = (around >= 0) & (around < self.n)
+        if sessions is not None:
+            inside &= sessions[np.clip(around, 0, self.n - 1)] == sessions[places, None]
         keys = (queries[:, None] * self.n + around)[inside]
         return replace(self, keys=np.unique(keys))
+
+    def on_route(self, positions: np.ndarray) -> Self:
+        """
+        Accept the places at the position of an accepted one as well, as of other sessions.
+
+        :param positions: of each place along the route, whole numbers, (n,).
+        """
+        _, position = np.unique(positions, return_inverse=True)
+        has_position = csr_array((np.ones(self.n), (np.arange(self.n), position)))
+        pairs = csr_array((np.ones(len(self.keys)), self.pairs.T), (self.N, self.n))
+        queries, places = (pairs @ has_position @ has_position.T).nonzero()
+        return replace(self, keys=np.unique(queries.astype(np.int64) * self.n + places))
 
     def select(self, indices: np.ndarray) -> Self:
         """
