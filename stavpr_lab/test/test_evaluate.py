@@ -324,11 +324,15 @@ def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, repor
     declared = sum(row['probability'] != 'nan' for row in rows)
     early = result['decision']['early_matched']
     assert calibration['images'] == declared + early > declared
-    assert f'{early} early matches, 0 of them wrongly' in text
+    assert result['decision']['early_with_truth'] == early
     # a node has the first match with the early ones, and none for the end of the last window
     online, matched = (result['decision'][name] for name in ('online_matched', 'matched'))
     assert early < online < matched == len(rows)
-    assert f'(online: {online}, when each image comes)' in text
+    first = result['decision']['first_matched']
+    assert 0 < first < early
+    assert f'in a node: {online} of {len(rows)} images, the first is image {first}\n' in text
+    shown = f'full: {early} of the online matches; 0 of the {early} with ground truth are wrong'
+    assert shown in text
     error = calibration['expected_calibration_error']
     assert f'expected calibration error {error:.4f}' in text
     page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')
@@ -435,7 +439,7 @@ def test_evaluate_without_truth_reports_matches_of_unequal_traverses(folders, ru
     assert output.splitlines()[0] == 'elsewhere on the map map, no ground truth'
     assert 'matched, default: ' in output
     result = read_json((tmp_path / 'report' / 'results.json').read_text())
-    counts = {'matched', 'early_matched', 'online_matched'}
+    counts = {'matched', 'early_matched', 'online_matched', 'first_matched'}
     assert result['decision'].keys() == {'rule', 'images', *counts}
     assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & result.keys()
     with (tmp_path / 'report' / 'answers.csv').open() as file:

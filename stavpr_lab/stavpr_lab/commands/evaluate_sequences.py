@@ -294,8 +294,7 @@ def _ground_truth(
         return GroundTruth.identity(N, n, tolerance)
     if arguments.truth != 'poses':
         truth = GroundTruth.from_file(arguments.truth, N, n, names=(query.ids, reference.ids))
-        positions, _ = along_route(reference)
-        return truth.widened(tolerance, reference.session_index).on_route(positions)
+        return truth.widened(tolerance, along_route(reference)[0])
     same = reference is query
     queries = poses_of(arguments.query_poses, query, 'query', arguments.degrees)
     path = arguments.query_poses if same else arguments.map_poses

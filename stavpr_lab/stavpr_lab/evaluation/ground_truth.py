@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from stavpr_lab.evaluation.ground_truth_files import Names, read_pairs
 from stavpr_ros.checks import require_shape
@@ -239,36 +238,22 @@ class GroundTruth:
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return (self.keys[at] == keys) & (places >= 0)
 
-    def widened(self, tolerance: int, sessions: np.ndarray | None = None) -> Self:
+    def widened(self, tolerance: int, positions: np.ndarray | None = None) -> Self:
         """
         Accept ``tolerance`` places before and after each accepted one as well.
 
-        :param sessions: of each place, (n,); only places of the same one are accepted.
+        :param positions: of each place along the route, (n,), int64, equal in several sessions;
+            None = 0 .. n - 1.
         :raises InputError: no whole number >= 0.
         """
         if not tolerance >= 0 or not float(tolerance).is_integer():
             raise InputError(f'tolerance {tolerance}: expected a whole number of places >= 0')
-        if tolerance == 0:
-            return self
-        queries, places = self.pairs.T
-        around = places[:, None] + np.arange(-int(tolerance), int(tolerance) + 1)
-        inside = (around >= 0) & (around < self.n)
-        if sessions is not None:
-            inside &= sessions[np.clip(around, 0, self.n - 1)] == sessions[places, None]
-        keys = (queries[:, None] * self.n + around)[inside]
+        positions = np.arange(self.n) if positions is None else positions
+        order, (queries, places) = np.argsort(positions), self.pairs.T
+        ends = positions[places] + [[-int(tolerance)], [int(tolerance) + 1]]
+        firsts, ends = np.searchsorted(positions, ends, sorter=order)
+        keys = np.repeat(queries * self.n, ends - firsts) + order[_ranges(firsts, ends)]
         return replace(self, keys=np.unique(keys))
-
-    def on_route(self, positions: np.ndarray) -> Self:
-        """
-        Accept the places at the position of an accepted one as well, as of other sessions.
-
-        :param positions: of each place along the route, whole numbers, (n,).
-        """
-        _, position = np.unique(positions, return_inverse=True)
-        has_position = csr_array((np.ones(self.n), (np.arange(self.n), position)))
-        pairs = csr_array((np.ones(len(self.keys)), self.pairs.T), (self.N, self.n))
-        queries, places = (pairs @ has_position @ has_position.T).nonzero()
-        return replace(self, keys=np.unique(queries.astype(np.int64) * self.n + places))
 
     def select(self, indices: np.ndarray) -> Self:
         """
@@ -278,10 +263,8 @@ class GroundTruth:
         """
         counts = self._counts[indices]
         firsts = np.searchsorted(self.keys, indices.astype(np.int64) * self.n)
-        # position of a pair in keys: position of its query's first pair, plus its rank there
-        at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
-        rows = np.repeat(np.arange(len(indices)), counts)
-        keys, stated = rows * self.n + self.keys[at] % self.n, self.stated
+        places = self.keys[_ranges(firsts, firsts + counts)] % self.n
+        keys, stated = np.repeat(np.arange(len(indices)) * self.n, counts) + places, self.stated
         stated = None if stated is None else stated[indices]
         return replace(self, N=len(indices), keys=keys, stated=stated)
 
@@ -316,6 +299,12 @@ class GroundTruth:
         later, earlier = pairs.max(axis=1), pairs.min(axis=1)
         past = later - earlier > exclude
         return replace(self, keys=np.unique(later[past] * self.n + earlier[past]), stated=None)
+
+
+def _ranges(firsts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return the whole numbers first .. end - 1 of each pair, one range after the other."""
+    counts = ends - firsts
+    return np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
 
 
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
