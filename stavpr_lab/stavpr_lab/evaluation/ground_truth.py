@@ -188,11 +188,7 @@ class GroundTruth:
 
     @cached_property
     def middles(self) -> np.ndarray:
-        """
-        Return the middle one of each query's accepted places, shape (N,), int64; -1 = none.
-
-        Of places that do not follow each other, as of several sessions, the first run counts.
-        """
+        """Return the middle of each query's first accepted places, (N,), int64; -1 = none."""
         middles = np.full(self.N, -1, np.int64)
         queries, firsts, lasts = self.runs
         own, at = np.unique(queries, return_index=True)
@@ -242,8 +238,7 @@ class GroundTruth:
         """
         Accept ``tolerance`` places before and after each accepted one as well.
 
-        :param positions: of each place along the route, (n,), int64, equal in several sessions;
-            None = 0 .. n - 1.
+        :param positions: of each place along the route, (n,), int64; None = 0 .. n - 1.
         :raises InputError: no whole number >= 0.
         """
         if not tolerance >= 0 or not float(tolerance).is_integer():
