@@ -97,9 +97,8 @@ def test_truth_of_one_session_counts_matches_of_every_session(folders, numbers, 
     same = np.tile(np.arange(PLACES, dtype=np.int32), 2)
     save_map(replace(merge_maps(maps, 'ab'), same_as=same), tmp_path / 'both.stavpr')
     (tmp_path / 'pairs.csv').write_text(''.join(f'{i},{i}\n' for i in range(0, PLACES, 5)))
-    options = '--truth', tmp_path / 'pairs.csv', '--tolerance', 2
-    result = numbers('--map', tmp_path / 'both.stavpr', '--query', folders / 'shifted', *options)
-    decision = result['decision']
+    options = '--query', folders / 'shifted', '--truth', tmp_path / 'pairs.csv', '--tolerance', 2
+    decision = numbers('--map', tmp_path / 'both.stavpr', *options)['decision']
     assert (decision['matched_with_truth'], decision['wrongly_matched']) == (12, 0)
 
 
@@ -325,8 +324,7 @@ def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, repor
     # a node has the first match with the early ones, and none for the end of the last window
     online, matched = (result['decision'][name] for name in ('online_matched', 'matched'))
     assert early < online < matched == len(rows)
-    first = result['decision']['first_matched']
-    assert 0 < first < early
+    assert 0 < (first := result['decision']['first_matched']) < early
     assert f'in a node: {online} of {len(rows)} images, the first is image {first}\n' in text
     shown = f'full: {early} of the online matches; 0 of the {early} with ground truth are wrong'
     assert shown in text
