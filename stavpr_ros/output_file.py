@@ -188,6 +188,8 @@ def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) 
         is not given.
     :raises OutputError: its folder is missing or write-protected.
     """
+    if os.fspath(path) == '-':
+        raise OutputError('-: only `record` writes to the standard output: name a file, as ./-')
     target = os.path.realpath(path)
     require_room(target)
     if not os.path.lexists(target):

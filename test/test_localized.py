@@ -18,7 +18,8 @@ from robot import LATCHED, LENGTH
 from sensor_msgs.msg import CompressedImage
 from stavpr_msgs.msg import PlaceCandidates
 from stavpr_ros.mapping import Session
-from stavpr_ros.ros.localized import along_route, Localization, NOWHERE
+from stavpr_ros.mapping.merging import along_route
+from stavpr_ros.ros.localized import Localization, NOWHERE
 from stavpr_ros.ros.subgoal import place_ahead, thumbnail_of_width
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger

@@ -200,7 +200,8 @@ def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive, c
     assert both.session_index.tolist() == [0] * 24 + [1] * 24 + [2] * 24
     assert both.same_as[48:].tolist() == list(range(24))  # the same drive again
     assert main(['info', 'both.stavpr']) == 0
-    assert ' day-2, day: 24 places, 24 of them in earlier ones' in capsys.readouterr().out
+    assert 'session    day: 24 places\n' in (shown := capsys.readouterr().out)
+    assert ' day-2, day: 24 places, 24 show places of earlier sessions' in shown
     apart = ['merge', 'apart.stavpr', 'day.stavpr', 'night.stavpr', '--different-routes']
     assert main(apart) == 0
     assert load_map('apart.stavpr').same_as is None

@@ -193,6 +193,8 @@ def test_require_replaceable_names_what_is_wrong(tmp_path):
     ):
         with pytest.raises(OutputError, match=text):
             require_replaceable(tmp_path / name, JSON, force=True)
+    with pytest.raises(OutputError, match='only `record` writes to the standard output'):
+        require_replaceable('-', JSON)
     require_replaceable(tmp_path / 'new', JSON)
 
 

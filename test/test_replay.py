@@ -544,6 +544,13 @@ def test_record_over_an_old_recording_is_refused_without_force(record, tmp_path)
     assert (tmp_path / 'old.jsonl').read_text() == OLD
 
 
+def test_record_shows_matches_on_the_standard_output(record, robot, publisher):
+    process = record('--output', '-')
+    recording(robot, process)
+    publisher.publish(PlaceMatch(place_index=7))
+    robot.until(lambda: '"place_index": 7' in process.output(), 'the match')
+
+
 def test_record_replaces_an_old_recording_at_the_first_message(record, robot, publisher, tmp_path):
     path = tmp_path / 'old.jsonl'
     process = record('--force')

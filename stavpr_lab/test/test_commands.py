@@ -324,6 +324,12 @@ def test_demo_terminated_ends_its_processes(traverse, tmp_path):
     assert str(output) not in listed.stdout
 
 
+def test_stavpr_without_ros_names_the_shell_that_has_it(monkeypatch, capsys):
+    monkeypatch.setattr(stavpr, 'ROS_MODULES', ('not_installed',))
+    assert stavpr.main(['node']) == 2
+    assert 'without a ROS installation, run `make shell`' in capsys.readouterr().err
+
+
 def test_demonstration_imports_no_package_of_the_extra_evaluation():
     code = (
         'import sys; sys.modules.update(dict.fromkeys(("sklearn", "jinja2")))\n'

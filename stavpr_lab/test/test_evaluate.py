@@ -3,6 +3,7 @@
 """The command evaluate on traverses and descriptors: numbers, exports, the page of its report."""
 
 import csv
+from dataclasses import replace
 from glob import glob
 import json
 import os
@@ -88,6 +89,17 @@ def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_pat
     assert same['settings']['odometry'] == str(paths['left'])
     other = numbers(*options, '--odometry', paths['right'])['decision']
     assert other['matched'] < plain['matched'] - 15
+
+
+def test_truth_of_one_session_counts_matches_of_every_session(folders, numbers, tmp_path):
+    extractor = FeatureExtractor('gradient')
+    maps = [build_map(open_source(folders / name), extractor) for name in ('map', 'shifted')]
+    same = np.tile(np.arange(PLACES, dtype=np.int32), 2)
+    save_map(replace(merge_maps(maps, 'ab'), same_as=same), tmp_path / 'both.stavpr')
+    (tmp_path / 'pairs.csv').write_text(''.join(f'{i},{i}\n' for i in range(0, PLACES, 5)))
+    options = '--query', folders / 'shifted', '--truth', tmp_path / 'pairs.csv', '--tolerance', 2
+    decision = numbers('--map', tmp_path / 'both.stavpr', *options)['decision']
+    assert (decision['matched_with_truth'], decision['wrongly_matched']) == (12, 0)
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
@@ -308,11 +320,14 @@ def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, repor
     declared = sum(row['probability'] != 'nan' for row in rows)
     early = result['decision']['early_matched']
     assert calibration['images'] == declared + early > declared
-    assert f'{early} early matches, 0 of them wrongly' in text
+    assert result['decision']['early_with_truth'] == early
     # a node has the first match with the early ones, and none for the end of the last window
     online, matched = (result['decision'][name] for name in ('online_matched', 'matched'))
     assert early < online < matched == len(rows)
-    assert f'(online: {online}, when each image comes)' in text
+    assert 0 < (first := result['decision']['first_matched']) < early
+    assert f'in a node: {online} of {len(rows)} images, the first is image {first}\n' in text
+    shown = f'full: {early} of the online matches; 0 of the {early} with ground truth are wrong'
+    assert shown in text
     error = calibration['expected_calibration_error']
     assert f'expected calibration error {error:.4f}' in text
     page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')
@@ -419,7 +434,7 @@ def test_evaluate_without_truth_reports_matches_of_unequal_traverses(folders, ru
     assert output.splitlines()[0] == 'elsewhere on the map map, no ground truth'
     assert 'matched, default: ' in output
     result = read_json((tmp_path / 'report' / 'results.json').read_text())
-    counts = {'matched', 'early_matched', 'online_matched'}
+    counts = {'matched', 'early_matched', 'online_matched', 'first_matched'}
     assert result['decision'].keys() == {'rule', 'images', *counts}
     assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & result.keys()
     with (tmp_path / 'report' / 'answers.csv').open() as file:

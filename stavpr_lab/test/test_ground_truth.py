@@ -76,6 +76,14 @@ def test_widened_stays_within_query_and_map():
             by_hand().widened(wrong)
 
 
+def test_pairs_are_widened_along_the_route_in_every_session():
+    """Places 3 to 5, of the second session, are at the positions of 0 to 2."""
+    truth = GroundTruth.from_pairs(np.array([0, 1]), np.array([2, 5]), 2, 6)
+    route = truth.widened(1, np.array([0, 1, 2, 0, 1, 2]))
+    assert route.pairs.tolist() == [[image, place] for image in (0, 1) for place in (1, 2, 4, 5)]
+    assert route.middles.tolist() == [1, 1]
+
+
 def test_loop_closures_of_either_triangle_are_the_same():
     lower = np.zeros((5, 5), bool)
     lower[3, 0] = lower[4, 1] = lower[4, 3] = True

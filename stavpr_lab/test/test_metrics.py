@@ -205,7 +205,7 @@ def results_of(places, scores):
     reduced = ReducedDistances(np.zeros((1, 1)), (60, 60))
     accepted, unknown = matches.scores < 1, np.full(len(places), np.nan)
     published = ImageMatches.none(len(places)), np.arange(len(places))
-    columns = accepted, unknown, published
+    columns = accepted, unknown, published, published[1]
     return TraverseResults(matches, matches, np.zeros(len(places)), (), reduced, *columns)
 
 

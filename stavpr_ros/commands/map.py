@@ -262,7 +262,8 @@ def describe(place_map: 'Map', path: Path) -> str:
     for number, session in enumerate(place_map.sessions):
         assert place_map.session_index is not None
         places = np.count_nonzero(place_map.session_index == number)
-        names = ''.join(f', {text}' for text in (session.name, session.robot) if text)
+        texts = dict.fromkeys((session.id, session.name, session.robot))
+        names = ', '.join(filter(None, texts))
         if session.camera:
             yaw = session.yaw
             names += f', camera {session.camera}' + (
@@ -270,10 +271,11 @@ def describe(place_map: 'Map', path: Path) -> str:
             )
         start = f', {_time(session.start)}' if session.start >= DATED else ''
         same = ''
-        if place_map.same_as is not None:
+        if place_map.same_as is not None and number:
             own = np.flatnonzero(place_map.session_index == number)
-            same = f', {np.count_nonzero(place_map.same_as[own] != own)} of them in earlier ones'
-        lines.append(f'session    {session.id}{names}: {places} places{same}{start}')
+            shared = np.count_nonzero(place_map.same_as[own] != own)
+            same = f', {shared} show places of earlier sessions'
+        lines.append(f'session    {names}: {places} places{same}{start}')
     return '\n'.join(map(printable, lines))
 
 

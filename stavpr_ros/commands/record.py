@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Sequence
+from contextlib import nullcontext
 import json
 import math
 import os
@@ -14,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from stavpr_ros.commands.program import make_parser, run_program, say
 from stavpr_ros.errors import OutputError
-from stavpr_ros.output_file import atomic_output, AtomicFile, RECORDING
+from stavpr_ros.output_file import atomic_output, RECORDING
 from stavpr_ros.units import SECOND, WRAP
 
 if TYPE_CHECKING:
@@ -71,7 +72,9 @@ def _run(args: list[str]) -> None:
     from stavpr_ros.ros.process import own_arguments
 
     arguments = _parser().parse_args(own_arguments(args))
-    with atomic_output(arguments.output, RECORDING, arguments.force) as file:
+    name, is_shown = arguments.output, arguments.output == '-'
+    stdout = nullcontext(sys.stdout.buffer)
+    with stdout if is_shown else atomic_output(name, RECORDING, arguments.force) as file:
         recorder = Recorder(file, arguments.output, arguments.kind)
         _record_messages(recorder, arguments.kind, args)
         recorder.finish()
@@ -82,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
         'record', 'Write matches, or loop closures, to a file, one JSON object per line.', EPILOG
     )
     parser.add_argument(
-        '--output', required=True, metavar='FILE', help='the file to write (JSON lines)'
+        '--output', required=True, metavar='FILE', help='file of JSON lines; -: shows them'
     )
     parser.add_argument(
         '--force', action='store_true', help='replace an existing recording, at the first message'
@@ -102,11 +105,11 @@ class Recorder:
     """
     Writes messages to a file, one JSON object per line; ``count`` of them.
 
-    :param file: of :func:`atomic_output`, of this name.
+    :param file: of :func:`atomic_output`, of this name, or the standard output.
     :param kind: matches or loop closures.
     """
 
-    def __init__(self, file: AtomicFile, name: str, kind: str = MATCHES) -> None:
+    def __init__(self, file: Any, name: str, kind: str = MATCHES) -> None:
         self._file, self._name, self._kind, self.count = file, name, kind, 0
 
     def write(self, message: Any) -> None:
@@ -120,8 +123,10 @@ class Recorder:
         size = os.fstat(file.fileno()).st_size
         try:
             file.write(line.encode())
-            file.flush() if file.committed else file.commit()
+            file.flush() if self._name == '-' or file.committed else file.commit()
         except OSError as error:
+            if self._name == '-':
+                raise
             os.ftruncate(file.fileno(), size)
             content = f'it has {self.count} {self._kind}, all of them whole'
             raise OutputError(
@@ -133,9 +138,9 @@ class Recorder:
 
     def finish(self) -> None:
         """Keep an earlier recording where there is no message to replace it by."""
-        if not self.count and os.path.exists(self._name):
+        if not self.count and self._name != '-' and os.path.exists(self._name):
             self._file.abandon()
-        say(f'{self.count} {self._kind} written to {self._name}')
+        say(f'{self.count} {self._kind} written to {self._name}', sys.stderr)
 
 
 def _record_messages(recorder: Recorder, kind: str, ros_arguments: list[str]) -> None:
@@ -155,11 +160,11 @@ def _record_messages(recorder: Recorder, kind: str, ros_arguments: list[str]) ->
         topic = subscription.topic_name
         discovery = Discovery(node, lambda: node.get_publishers_info_by_topic(topic))
         try:
-            print(f'waiting for a publisher of {topic}', flush=True)
+            say(f'waiting for a publisher of {topic}', sys.stderr)
             spin_until(node, lambda: subscription.get_publisher_count() > 0)
             spin_until(node, discovery.done)
             node.create_publisher(Empty, f'~/{READY}', 1)  # replay --lossless waits for it
-            print(f'recording {topic}', flush=True)  # no message is missed from now on
+            say(f'recording {topic}', sys.stderr)  # no message is missed from now on
             spin_until(node)
         except KeyboardInterrupt:  # the usual end
             count = -1

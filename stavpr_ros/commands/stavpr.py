@@ -96,7 +96,7 @@ def _main(arguments: list[str]) -> int:
         print(
             f'stavpr {name}: needs ROS 2, but Python finds no {", ".join(missing)}: source '
             '/opt/ros/jazzy/setup.bash and the install/setup.bash of the workspace that colcon '
-            'built',
+            'built, or, without a ROS installation, run `make shell` in the repository',
             file=sys.stderr,
         )
         return 2

@@ -75,7 +75,7 @@ def with_same_places(place_map: Map, first: int = 1) -> Map:
     same_as, numbers = np.arange(n), range(max(first, 1), len(place_map.sessions))
     if first > 1 and place_map.same_as is not None:
         same_as = place_map.same_as.astype(np.int64)
-    for session in Progress(numbers, desc='same places', unit='session'):
+    for session in Progress(numbers, desc='comparing sessions', unit='session'):
         views = [n for n in range(session) if not _looks_elsewhere(place_map, n, session)]
         earlier, places = np.flatnonzero(np.isin(index, views)), np.flatnonzero(index == session)
         if not len(earlier):

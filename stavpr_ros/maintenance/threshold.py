@@ -63,7 +63,7 @@ def suggest_threshold(place_map: Map, model: str = '') -> float:
     rng = np.random.default_rng(0)
     distances = []
     starts = np.unique(np.linspace(0, n - l, min(WINDOWS, n - l + 1)).astype(int))
-    for variant, start in enumerate(Progress(starts, desc='self-test', unit='window')):
+    for variant, start in enumerate(Progress(starts, desc='estimating threshold', unit='window')):
         images = [place_map.thumbnail(place) for place in range(start, start + l)]
         altered = [alter_image(image, variant, rng) for image in images if image is not None]
         features = extractor.extract(altered)

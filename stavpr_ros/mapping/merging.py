@@ -131,6 +131,25 @@ def _free_id(base: str, sessions: list[Session]) -> str:
     return next(name for name in names if name not in others)
 
 
+def along_route(places: Map) -> tuple[np.ndarray, int]:
+    """
+    Return the position of each place along the route, (n,), and the places of a closed lap.
+
+    A place that an earlier session shows as well has the position of the place there, and the
+    places after it follow, up to the next such place.
+    """
+    numbers = np.arange(len(places))
+    if places.same_as is None:
+        return numbers, 0
+    related = np.where(places.same_as < numbers, numbers, -1)
+    session = np.zeros(len(places), int) if places.session_index is None else places.session_index
+    for run in np.split(numbers, np.flatnonzero(np.diff(session)) + 1):
+        related[run] = np.maximum.accumulate(related[run])
+    positions = np.where(related < 0, numbers, places.same_as[related] + numbers - related)
+    seam = places.seam
+    return positions, 0 if seam is None else len(places) - 1 - seam
+
+
 def _join_same_as(maps: Sequence[Map]) -> np.ndarray | None:
     if all(part.same_as is None for part in maps):
         return None

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes whether the robot is localized, with hysteresis, and at which place: latched."""
 
-from collections.abc import Sequence
 import math
 
 import numpy as np
 from rclpy.node import Node
-from stavpr_ros.mapping import Map
+from stavpr_ros.mapping.merging import along_route
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.ros.messages import Outcome, Places
 from stavpr_ros.ros.output import Publishers
@@ -76,25 +75,6 @@ class Localization:
             self._first, self._tried, self._confirmed = place, 0, 0
 
 
-def along_route(places: Map) -> tuple[Sequence[int] | np.ndarray, int]:
-    """
-    Return the position of each place along the route, (n,), and the places of a closed lap.
-
-    A place that an earlier session shows as well has the position of the place there, and the
-    places after it follow, up to the next such place.
-    """
-    if places.same_as is None:
-        return range(len(places)), 0
-    numbers = np.arange(len(places))
-    related = np.where(places.same_as < numbers, numbers, -1)
-    session = np.zeros(len(places), int) if places.session_index is None else places.session_index
-    for run in np.split(numbers, np.flatnonzero(np.diff(session)) + 1):
-        related[run] = np.maximum.accumulate(related[run])
-    positions = np.where(related < 0, numbers, places.same_as[related] + numbers - related)
-    seam = places.seam
-    return positions, 0 if seam is None else len(places) - 1 - seam
-
-
 class LocalizedPublisher(Publishers):
     """Publishes ``~/localized`` and ``~/current_node`` when they change."""
 
@@ -104,7 +84,7 @@ class LocalizedPublisher(Publishers):
         self._localized = self._make(Bool, '~/localized', LATCHED)
         self._current_node = self._make(String, '~/current_node', LATCHED)
         self._places: Places = None
-        self._route: tuple[Sequence[int] | np.ndarray, int] = (), 0
+        self._route: tuple[np.ndarray, int] = np.arange(0), 0
         self._published: tuple[bool | None, str] = (None, '')
         self._publish(NOWHERE)
 

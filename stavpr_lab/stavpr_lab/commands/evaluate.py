@@ -343,11 +343,13 @@ def _print_report(report: 'Report') -> None:
         wrong = f'; of {stated} with ground truth, {decision["matched_with_truth"]}{wrong}'
     if report.default_threshold is not None:
         print(f'matched above the probability {1 - report.default_threshold:.4g}')
-    online = f' (online: {decision["online_matched"]}, when each image comes)'
-    print(f'matched, {decision["rule"]}: {decision["matched"]} of {images} images{wrong}{online}')
-    if decision['early_matched']:
-        wrong = f', {decision["early_wrong"]} of them wrongly' if report.has_truth else ''
-        print(f'and {decision["early_matched"]} early matches{wrong}')
+    print(f'matched, {decision["rule"]}: {decision["matched"]} of {images} images{wrong}')
+    if online := decision['online_matched']:
+        first, early = decision['first_matched'], decision['early_matched']
+        print(f'online, as in a node: {online} of {images} images, the first is image {first}')
+        wrong = '; {early_wrong} of the {early_with_truth} with ground truth are wrong'
+        wrong = wrong.format(**decision) if report.has_truth else ''
+        print(f'early, before a window is full: {early} of the online matches{wrong}')
     if report.has_truth:
         from stavpr_lab.evaluation.protocol import text
 

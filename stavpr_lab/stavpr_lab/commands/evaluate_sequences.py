@@ -22,6 +22,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import AUTO
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, Map, select_places
 from stavpr_ros.mapping.builder import fit_value_range
+from stavpr_ros.mapping.merging import along_route
 from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.parameters import default
 from stavpr_ros.sources import is_folder, open_source
@@ -292,8 +293,8 @@ def _ground_truth(
     if arguments.truth == 'identity':
         return GroundTruth.identity(N, n, tolerance)
     if arguments.truth != 'poses':
-        names = query.ids, reference.ids
-        return GroundTruth.from_file(arguments.truth, N, n, tolerance, names)
+        truth = GroundTruth.from_file(arguments.truth, N, n, names=(query.ids, reference.ids))
+        return truth.widened(tolerance, along_route(reference)[0])
     same = reference is query
     queries = poses_of(arguments.query_poses, query, 'query', arguments.degrees)
     path = arguments.query_poses if same else arguments.map_poses

@@ -192,11 +192,8 @@ class Drive:
         each one that the map keeps. An image of several places counts for the first of them.
         """
         truth = self.recorded
-        queries, places = truth.pairs.T
-        breaks = np.flatnonzero((np.diff(places) != 1) | (np.diff(queries) != 0)) + 1
-        firsts = np.concatenate([[0], breaks]) if len(places) else breaks
-        lasts = np.append(firsts[1:], len(places)) - 1 if len(places) else breaks
-        run_query, middle = queries[firsts], (places[firsts] + places[lasts]) // 2
+        run_query, firsts, lasts = truth.runs
+        middle = (firsts + lasts) // 2
         at = np.searchsorted(self.places, middle)
         before = self.places[np.maximum(at - 1, 0)]
         after = self.places[np.minimum(at, len(self.places) - 1)]

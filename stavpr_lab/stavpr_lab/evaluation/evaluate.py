@@ -85,7 +85,7 @@ class TraverseResults:
     :param accepted: whether the recognizer accepts the window's match, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
     :param published: M >= N matches: the early ones behind these, and the image of each, (M,).
-    :param online: images at which the recognizer had a match at once, as a node has; N at most.
+    :param online: images at which the recognizer had a match at once, as a node has, ascending.
     """
 
     sequence: Ranking
@@ -96,7 +96,7 @@ class TraverseResults:
     accepted: np.ndarray = field(repr=False)
     probabilities: np.ndarray = field(repr=False)
     published: tuple[ImageMatches, np.ndarray] = field(repr=False)
-    online: int = 0
+    online: np.ndarray = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def recognize_traverse(
     sequence, distances = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
         sequence, single, seconds, *distances, matched.accepted, matched.probabilities, published,
-        sum(match.accepted for match in matches),
+        np.flatnonzero([match.accepted for match in matches]),
     )  # fmt: skip
 
 

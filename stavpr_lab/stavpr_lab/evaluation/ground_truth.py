@@ -188,12 +188,21 @@ class GroundTruth:
 
     @cached_property
     def middles(self) -> np.ndarray:
-        """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
+        """Return the middle of each query's first accepted places, (N,), int64; -1 = none."""
         middles = np.full(self.N, -1, np.int64)
-        ends = np.cumsum(self._counts)
-        at = (2 * ends - self._counts - 1) // 2
-        middles[self.has_match] = self.keys[at[self.has_match]] % self.n
+        queries, firsts, lasts = self.runs
+        own, at = np.unique(queries, return_index=True)
+        middles[own] = (firsts[at] + lasts[at]) // 2
         return middles
+
+    @property
+    def runs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return query, first and last place of each run of accepted places, in order, (R,)."""
+        queries, places = self.pairs.T
+        is_first = np.diff(places, prepend=-2) != 1
+        is_first[1:] |= np.diff(queries) != 0
+        is_last = np.append(is_first, True)[1:]
+        return queries[is_first], places[is_first], places[is_last]
 
     @cached_property
     def _counts(self) -> np.ndarray:
@@ -225,20 +234,20 @@ class GroundTruth:
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return (self.keys[at] == keys) & (places >= 0)
 
-    def widened(self, tolerance: int) -> Self:
+    def widened(self, tolerance: int, positions: np.ndarray | None = None) -> Self:
         """
         Accept ``tolerance`` places before and after each accepted one as well.
 
+        :param positions: of each place along the route, (n,), int64; None = 0 .. n - 1.
         :raises InputError: no whole number >= 0.
         """
         if not tolerance >= 0 or not float(tolerance).is_integer():
             raise InputError(f'tolerance {tolerance}: expected a whole number of places >= 0')
-        if tolerance == 0:
-            return self
-        queries, places = self.pairs.T
-        around = places[:, None] + np.arange(-int(tolerance), int(tolerance) + 1)
-        inside = (around >= 0) & (around < self.n)
-        keys = (queries[:, None] * self.n + around)[inside]
+        positions = np.arange(self.n) if positions is None else positions
+        order, (queries, places) = np.argsort(positions), self.pairs.T
+        ends = positions[places] + [[-int(tolerance)], [int(tolerance) + 1]]
+        firsts, ends = np.searchsorted(positions, ends, sorter=order)
+        keys = np.repeat(queries * self.n, ends - firsts) + order[_ranges(firsts, ends)]
         return replace(self, keys=np.unique(keys))
 
     def select(self, indices: np.ndarray) -> Self:
@@ -249,10 +258,8 @@ class GroundTruth:
         """
         counts = self._counts[indices]
         firsts = np.searchsorted(self.keys, indices.astype(np.int64) * self.n)
-        # position of a pair in keys: position of its query's first pair, plus its rank there
-        at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
-        rows = np.repeat(np.arange(len(indices)), counts)
-        keys, stated = rows * self.n + self.keys[at] % self.n, self.stated
+        places = self.keys[_ranges(firsts, firsts + counts)] % self.n
+        keys, stated = np.repeat(np.arange(len(indices)) * self.n, counts) + places, self.stated
         stated = None if stated is None else stated[indices]
         return replace(self, N=len(indices), keys=keys, stated=stated)
 
@@ -287,6 +294,12 @@ class GroundTruth:
         later, earlier = pairs.max(axis=1), pairs.min(axis=1)
         past = later - earlier > exclude
         return replace(self, keys=np.unique(later[past] * self.n + earlier[past]), stated=None)
+
+
+def _ranges(firsts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return the whole numbers first .. end - 1 of each pair, one range after the other."""
+    counts = ends - firsts
+    return np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
 
 
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:

@@ -111,7 +111,8 @@ class Report:
         matches, images = self.evaluation.results.published
         early = slice(len(self.accepted), None)
         decision['early_matched'] = len(images[early])
-        decision['online_matched'] = self.evaluation.results.online
+        decision['online_matched'] = len(self.evaluation.results.online)
+        decision['first_matched'] = next(iter(self.evaluation.results.online.tolist()), None)
         if not self.has_truth:
             return decision
         truth = self.evaluation.ground_truth.select(images)
@@ -119,6 +120,7 @@ class Report:
         return decision | {
             'images_with_truth': len(self._compared_columns[0]),
             'matched_with_truth': counts.accepted,
+            'early_with_truth': int(np.count_nonzero(truth.is_stated[early])),
             'early_wrong': int(np.count_nonzero(wrong[early])),
             'wrongly_matched': counts.false_positives,
             'precision': counts.precision,
