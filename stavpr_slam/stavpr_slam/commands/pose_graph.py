@@ -11,8 +11,9 @@ HELP = """usage: pose_graph [--ros-args -p NAME:=VALUE ... -r odom:=TOPIC]
 A lifecycle node that configures and activates itself. It corrects the odometry on the topic `odom`
 (nav_msgs/Odometry) by the loop closures of recognition nodes: ~/path_before and ~/path
 (nav_msgs/Path), ~/odometry in the map frame, ~/map_to_odom, ~/edges (visualization_msgs/
-MarkerArray: accepted green, rejected red), /diagnostics. Services: ~/save (stavpr_msgs/SaveMap, a
-file .g2o, .tum or .kitti in the maps folder), ~/reset. The graph is in a process of its own.
+MarkerArray: accepted blue, rejected vermilion), /diagnostics. Services: ~/save
+(stavpr_msgs/SaveMap, a file .g2o, .tum or .kitti in the maps folder), ~/reset. The graph is in a
+process of its own.
 
 parameters:
 {parameters}

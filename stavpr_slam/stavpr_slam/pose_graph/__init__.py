@@ -7,6 +7,7 @@ from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphEdge, GraphSettings, optimize, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
+from stavpr_slam.pose_graph.transforms import body_covariance
 
 __all__ = [
     'ChainSettings',
@@ -16,5 +17,6 @@ __all__ = [
     'OdometryNoise',
     'PoseGraph',
     'align_maps',
+    'body_covariance',
     'optimize',
 ]

@@ -86,7 +86,7 @@ def path_bytes(frame: str, stamps: np.ndarray, poses: np.ndarray) -> bytes:
 
 
 def edge_markers(frame: str, accepted: np.ndarray, rejected: np.ndarray) -> MarkerArray:
-    """Return the ends of edges, (m, 2, 3), as lines: accepted ones green, rejected ones red."""
+    """Return the ends of edges, (m, 2, 3), as lines: blue if accepted, else vermilion."""
     markers = MarkerArray()
     for number, (ends, color) in enumerate(((accepted, ACCEPTED), (rejected, REJECTED))):
         marker = Marker(ns='closures', id=number, type=Marker.LINE_LIST, action=Marker.ADD)
