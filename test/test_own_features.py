@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import registry
+from stavpr_ros.features import FeatureExtractor, registry
 from stavpr_ros.mapping import load_map, Map
 from stavpr_ros.mapping.map_schema import identity_fields
 
@@ -63,3 +63,13 @@ def test_setting_of_a_type_that_map_files_lack_is_named(monkeypatch):
     monkeypatch.setitem(registry.KINDS, 'plain', registry.Kind(settings, f'{__name__}:Plain'))
     with pytest.raises(SettingsError, match='setting names of features plain'):
         identity_fields('plain')
+
+
+@pytest.mark.parametrize('missing', ['settings', 'feature_maps'])
+def test_class_that_lacks_a_member_is_an_error_with_its_name(monkeypatch, missing):
+    whole = {'settings': PlainSettings(), 'feature_maps': Plain.feature_maps}
+    members = {name: member for name, member in whole.items() if name != missing}
+    incomplete = type('Incomplete', (), {'__init__': lambda *_: None, **members})
+    monkeypatch.setattr(f'{__name__}.Plain', incomplete)
+    with pytest.raises(SettingsError, match=f'Incomplete.* features plain, has no {missing}'):
+        FeatureExtractor('plain')

@@ -262,7 +262,7 @@ class FeatureExtractor:
             logging.getLogger(__name__).info('%s', self.choice)
         if backbone is None:
             backbone = settings_class(kind)()
-        self._backbone: Backbone = backbone_class(kind)(backbone, device)
+        self._backbone = _make_backbone(kind, backbone, device)
         self.projection: Projection | None = None
         test_maps = None
         if isinstance(backbone, NetworkSettings) or isinstance(projection, int):
@@ -376,6 +376,19 @@ class FeatureExtractor:
             return np.asarray(maps, np.float32)[None], (1, 1)
         cells = (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
         return cut_strips(maps, W, pooling), cells
+
+
+def _make_backbone(kind: str, settings: Any, device: str) -> Backbone:
+    """Make the object of a kind's class; reject one that lacks a member, of another package."""
+    backbone = backbone_class(kind)(settings, device)
+    for name in ('settings', 'feature_maps'):
+        if not hasattr(backbone, name):
+            raise SettingsError(
+                f'{type(backbone).__name__}, the class of features {kind}, has no {name}: '
+                'expected the attribute settings and the method feature_maps, as in docs/features.md'
+            )
+    made: Backbone = backbone
+    return made
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
