@@ -18,7 +18,7 @@ from language import remarks
 import numpy as np
 from processes import environment
 import pytest
-from stavpr_msgs.msg import LoopClosure
+from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
 from stavpr_ros.units import SECOND
@@ -142,7 +142,7 @@ def simulated_drive() -> tuple[np.ndarray, np.ndarray, list]:
         edge.query_stamp.sec, edge.place_stamp.sec = i + 1, i + 1 - lap
         edge.pose.pose.position.x, edge.pose.pose.position.y = rng.normal(0, 0.03, 2)
         edge.pose.covariance = np.diag([0.01] * 3 + [0.001] * 3).ravel()
-        edge.is_independent = True
+        edge.is_independent, edge.source = True, RelativePose.PNP
         messages.append(closure)
     return drive(np.ones(n), turn)[:, :3], odometry, messages
 

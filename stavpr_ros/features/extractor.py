@@ -385,7 +385,7 @@ def _make_backbone(kind: str, settings: Any, device: str) -> Backbone:
         if not hasattr(backbone, name):
             raise SettingsError(
                 f'{type(backbone).__name__}, the class of features {kind}, has no {name}: '
-                'expected the attribute settings and the method feature_maps, as in docs/features.md'
+                'expected the attribute settings and the method feature_maps (docs/features.md)'
             )
     made: Backbone = backbone
     return made
