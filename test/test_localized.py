@@ -39,7 +39,7 @@ TREE_NODES = {
     'KeepRunningUntilFailure': set(),
     'ScriptCondition': {'code'},
     'ControllerSelector': {'topic_name', 'default_controller', 'selected_controller'},
-    'Spin': {'spin_dist', 'time_allowance', 'is_recovery', 'error_code_id'},
+    'Wait': {'wait_duration', 'error_code_id'},
     'PipelineSequence': set(),
     'RateController': {'hz'},
     'ComputePathToPose': {'goal', 'start', 'path', 'planner_id', 'error_code_id'},

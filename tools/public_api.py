@@ -31,8 +31,8 @@ PUBLIC = (
     'stavpr_ros', 'stavpr_ros.alignment', 'stavpr_ros.errors', 'stavpr_ros.features',
     'stavpr_ros.mapping', 'stavpr_ros.pipeline', 'stavpr_ros.method', 'stavpr_ros.sources',
     'stavpr_ros.sources.frame', 'stavpr_fleet', 'stavpr_slam.pose_graph',
-    'stavpr_lab.evaluation.evaluate', 'stavpr_lab.evaluation.ground_truth',
-    'stavpr_lab.evaluation.metrics',
+    'stavpr_slam.ros.graph_messages', 'stavpr_lab.evaluation.evaluate',
+    'stavpr_lab.evaluation.ground_truth', 'stavpr_lab.evaluation.metrics',
 )  # fmt: skip
 
 PARTS = {'.srv': ['/request', '/response'], '.action': ['/goal', '/result', '/feedback']}

@@ -9,15 +9,19 @@ from pathlib import Path
 import re
 import shlex
 import subprocess
+import sys
 import textwrap
 
 from evaluation_commands import write_images
 from fixtures import route_images
 from language import remarks
+import numpy as np
 from processes import environment
 import pytest
+from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
+from stavpr_ros.units import SECOND
 from videos import write_video
 import yaml
 
@@ -93,6 +97,71 @@ def test_examples_of_the_api_pages_run(run, page):
     lines = run(exec, textwrap.dedent(example), {}).splitlines()
     assert lines
     assert all('039.png' in line for line in lines[-1:]) is (page != 'mapping')
+
+
+def test_example_of_a_kind_of_features_installs_and_makes_a_map(workspace, tmp_path):
+    page = ROOT / 'docs/features.md'
+    module = next(code for code in code_blocks(page, 'python') if 'KIND =' in code)
+    (tmp_path / 'pyproject.toml').write_text(*code_blocks(page, 'toml'))
+    (tmp_path / 'gray32.py').write_text(module)
+    (command,) = re.findall(r'^stavpr .* gray32 .*$', page.read_text(), re.M)
+    install = '-m pip install --quiet --no-build-isolation --no-deps --no-index --target'
+    path = os.pathsep.join([str(tmp_path / 'site'), *filter(None, [os.environ.get('PYTHONPATH')])])
+    for words, folder in (
+        ([sys.executable, *install.split(), 'site', '.'], tmp_path),
+        (command.split(), workspace),
+    ):
+        subprocess.run(
+            words,
+            cwd=folder,
+            env=environment() | {'PYTHONPATH': path},
+            timeout=SECONDS,
+            check=True,
+        )
+    assert (workspace / 'gray.stavpr').stat().st_size > 0
+
+
+def simulated_drive() -> tuple[np.ndarray, np.ndarray, list]:
+    """Return true positions, odometry (n, 7) and loop closures of three laps of a circle."""
+    rng, n, lap = np.random.default_rng(0), 180, 60
+
+    def drive(step: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        yaw = np.cumsum(turn) - turn[0]
+        points = np.cumsum(step * np.exp(1j * yaw))
+        poses = np.zeros((n, 7))
+        poses[1:, :2] = np.stack([points.real, points.imag], axis=1)[:-1]
+        poses[:, 5:] = np.stack([np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
+        return poses
+
+    turn = np.full(n, 2 * np.pi / lap)
+    odometry = drive(1 + rng.normal(0, 0.03, n), turn + rng.normal(0.002, 0.005, n))
+    messages = []
+    for i in range(lap + 5, n, 5):
+        closure = LoopClosure(has_relative_pose=True)
+        edge = closure.relative_pose
+        edge.query_stamp.sec, edge.place_stamp.sec = i + 1, i + 1 - lap
+        edge.pose.pose.position.x, edge.pose.pose.position.y = rng.normal(0, 0.03, 2)
+        edge.pose.covariance = np.diag([0.01] * 3 + [0.001] * 3).ravel()
+        edge.is_independent, edge.source = True, RelativePose.PNP
+        messages.append(closure)
+    return drive(np.ones(n), turn)[:, :3], odometry, messages
+
+
+def test_example_of_the_slam_page_corrects_a_drive_by_optimize_and_gtsam():
+    pytest.importorskip('gtsam')
+    (example,) = code_blocks(ROOT / 'docs/slam.md', 'python')
+    truth, odometry, messages = simulated_drive()
+    stamps = (np.arange(len(odometry)) + 1) * SECOND
+    names = {'stamps': stamps, 'odometry': odometry, 'messages': messages}
+    exec(example, names)
+    by_gtsam = np.array([names['by_gtsam'].atPose3(i).translation() for i in range(len(truth))])
+    assert names['decided'].accepted == len(messages)
+
+    def error(points: np.ndarray) -> float:
+        return float(np.sqrt(((points - truth) ** 2).sum(axis=1).mean()))
+
+    assert error(odometry[:, :3]) > 1
+    assert max(error(names['corrected'][:, :3]), error(by_gtsam)) < 0.25
 
 
 def test_build_map_and_evaluate_examples_run(run, workspace):

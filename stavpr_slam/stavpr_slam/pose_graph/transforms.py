@@ -21,7 +21,8 @@ def body_covariance(covariance: np.ndarray, transform: np.ndarray) -> np.ndarray
     :param covariance: as in ``geometry_msgs/PoseWithCovariance``: x y z and rotations about the
         fixed axes of the parent frame, shape (6, 6).
     :param transform: the pose, shape (4, 4).
-    :returns: that of ``Z Exp([rotation, translation])``, shape (6, 6).
+    :returns: covariance of ``[rotation, translation]`` in ``Z Exp([rotation, translation])``, with
+        the pose Z, shape (6, 6).
     """
     turn = transform[:3, :3].T
     change = np.zeros((6, 6))

@@ -17,6 +17,8 @@ from stavpr_slam.pose_graph.alignment import APPEARANCE
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+__all__ = ['closure_of']  # the public names
+
 ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 ACCEPTED, REJECTED = (
@@ -25,7 +27,7 @@ ACCEPTED, REJECTED = (
 )
 
 
-def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
+def closure_of(message: LoopClosure, appearance: bool = False) -> Closure | None:
     """
     Return a loop closure as a measurement; None = it measures nothing.
 
