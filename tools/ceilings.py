@@ -14,15 +14,15 @@ import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
-    'lines of stavpr_ros': 30_721,
-    'lines of stavpr_fleet': 1_196,
-    'lines of stavpr_slam': 4_378,
+    'lines of stavpr_ros': 30_962,
+    'lines of stavpr_fleet': 1_199,
+    'lines of stavpr_slam': 4_678,
     'lines of stavpr_nav': 1_622,
-    'lines of stavpr_lab': 12_143,
-    'lines of the method (prepare, method)': 5_668,
-    'lines of all tests': 32_744,
-    'lines of benchmarks and tools': 8_811,
-    'lines of docs and README': 3_993,
+    'lines of stavpr_lab': 12_183,
+    'lines of the method (prepare, method)': 5_677,
+    'lines of all tests': 33_354,
+    'lines of benchmarks and tools': 9_072,
+    'lines of docs and README': 3_299,
     'parameters of the node': 51,
     'numbers in constants of the method': 147,
 }
