@@ -345,6 +345,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, drive_laps
     from stavpr_ros.commands.feature_options import make_extractor
 
+    slam.require_evo()
     _print('1. Three laps of a synthetic street, with a drifting odometry')
     drive = drive_laps(
         arguments.world, arguments.draw, arguments.drift, arguments.carried, arguments.sessions

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 import json
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,14 @@ def evaluate_drive(drive: LapDrive, trajectory: Path, values: dict[str, str]) ->
     return SlamResult(aligned_after, aligned_before, truth, poses_after, numbers)
 
 
+def require_evo() -> None:
+    """Raise UnavailableError where evo is not installed."""
+    if find_spec('evo') is None:
+        raise UnavailableError(
+            'the errors of trajectories require evo: pip install evo (the extra slam)'
+        )
+
+
 def trajectory_errors(
     stamps: np.ndarray, poses: np.ndarray, truth: np.ndarray
 ) -> tuple[float, float, np.ndarray]:
@@ -135,13 +144,10 @@ def trajectory_errors(
     :returns: rms of positions after alignment, m; rms over :data:`RPE_METERS`, m; poses (n, 7).
     :raises UnavailableError: evo is not installed.
     """
-    try:
-        from evo.core import metrics
-        from evo.core.trajectory import PoseTrajectory3D
-    except ImportError as error:
-        raise UnavailableError(
-            'the errors of trajectories require evo: pip install evo (the extra slam)'
-        ) from error
+    require_evo()
+    from evo.core import metrics
+    from evo.core.trajectory import PoseTrajectory3D
+
     seconds = (stamps - stamps[0]) / SECOND
     reference, estimate = (
         PoseTrajectory3D(trajectory[:, :3].copy(), trajectory[:, [6, 3, 4, 5]].copy(), seconds)
