@@ -124,7 +124,8 @@ CAMERAS = 'front', 'rear'
 @pytest.fixture
 def program(map_file, tmp_path):
     """Run the documented program in a folder with a map for each camera."""
-    (source,) = re.findall(r'^```python\n(.*?)^```', PAGE.read_text(), re.M | re.S)
+    blocks = re.findall(r'^```python\n(.*?)^```', PAGE.read_text(), re.M | re.S)
+    (source,) = (block for block in blocks if 'front' in block)
     (tmp_path / 'program.py').write_text(source)
     for camera in CAMERAS:
         shutil.copy(map_file, tmp_path / f'{camera}.stavpr')

@@ -327,7 +327,7 @@ def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(lesson, tmp_pa
     assert drive.speeds[covered][0] > 1
     assert drive.speeds[covered & (drive.times > COVERED + 1)].max() < 0.05
     assert drive.reasons[-1] == 'not localized on the route'
-    plot_repeat(lesson, {'dusk': drive}, tmp_path / 'repeat.png')
+    plot_repeat(lesson, [('dusk', drive)], tmp_path / 'repeat.png')
     assert (tmp_path / 'repeat.png').stat().st_size > 10_000
     animate(lesson, drive, images[:15], tmp_path / 'repeat.webp')
     assert (tmp_path / 'repeat.webp').stat().st_size > 10_000

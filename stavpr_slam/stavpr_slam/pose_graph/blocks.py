@@ -71,7 +71,7 @@ class Beliefs:
             prior = ((right @ weights)[:, None] + 1) / (weights.sum() + 2)
         evidence = np.log(prior * ratio + 1 - prior) @ weights
         # many false ones nearby fit large errors without being certain, and one fits by chance
-        is_certain = evidence >= tuning.CERTAIN * (right @ weights).clip(tuning.JOINS)
+        is_certain = evidence >= tuning.CERTAIN * (right @ weights).clip(tuning.JOINS / 2)
         evidence[1:] = np.where(is_certain, evidence - tuning.LOOSER, -np.inf)[1:]
         best = int(np.argmax(evidence))
         return replace(

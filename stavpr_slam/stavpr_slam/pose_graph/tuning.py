@@ -35,7 +35,7 @@ SPARE = 1.5  # times the active factors: a pattern of so many is used again
 FILLED = 6  # blocks for each active factor: a pattern with more is used for 2 % more only
 
 # sessions
-JOINS = 8  # closures that join two sessions, or that a factor on the stated errors needs
+JOINS = 8  # closures that join two sessions; half as many certain ones show a factor
 AGREEING = 0.25  # part of the closures between sessions that agree at least
 SAMPLE = 100  # closures between sessions that vote, and poses that they move, at most
 
