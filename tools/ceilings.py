@@ -22,7 +22,7 @@ CEILINGS = {
     'lines of the method (prepare, method)': 5_677,
     'lines of all tests': 33_355,
     'lines of benchmarks and tools': 9_072,
-    'lines of docs and README': 3_302,
+    'lines of docs and README': 3_299,
     'parameters of the node': 51,
     'numbers in constants of the method': 147,
 }
