@@ -30,6 +30,7 @@ def _lanes() -> int:
 LANES = _lanes()
 LINE = 16  # numbers of a cache line
 PREFETCH = 0, 2, 1  # to read; into the second cache; data
+FUSED = ('contract',)  # a product and a sum may be one instruction
 
 
 class Vector(types.Type):
@@ -149,16 +150,47 @@ def _shuffle(builder: Any, a: Any, b: Any, lanes: Any) -> Any:
 
 
 @intrinsic
-def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
-    """
-    Write the sums over the lanes of vectors into a flat array, from ``offset``.
+def add_products(typing: Any, totals: Any, array: Any, first: Any, pitch: Any, factor: Any) -> Any:
+    """Add vectors of a flat array, from ``first`` on and ``pitch`` apart, times one, to totals."""
 
-    The tuple has at most LANES vectors, and the array has room for LANES numbers behind the sums.
-    Halves are added up, as LLVM adds up lanes.
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        sums, at = cgutils.unpack_tuple(builder, arguments[0]), arguments[2]
+        for i, total in enumerate(sums):
+            pointer = _pointer(context, builder, array, arguments[1], at)
+            product = builder.fmul(builder.load(pointer, align=4), arguments[4], flags=FUSED)
+            sums[i] = builder.fadd(product, total, flags=FUSED)
+            at = builder.add(at, arguments[3])
+        return context.make_tuple(builder, signature.return_type, sums)
+
+    return totals(totals, array, types.intp, types.intp, factor), generate
+
+
+@intrinsic
+def store_all(typing: Any, array: Any, vectors: Any) -> Any:
+    """Write a tuple of vectors into a flat array, from its begin on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        for i, vector in enumerate(cgutils.unpack_tuple(builder, arguments[1])):
+            at = ir.Constant(ir.IntType(64), i * LANES)
+            pointer = _pointer(context, builder, array, arguments[0], at)
+            builder.store(vector, pointer, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, vectors), generate
+
+
+@intrinsic
+def store_sums(typing: Any, array: Any, offset: Any, vectors: Any, others: Any) -> Any:
+    """
+    Write the sums over the lanes of pairs of vectors into a flat array, from ``offset``.
+
+    The tuples have at most LANES vectors, and the array has room for LANES numbers behind the
+    sums. Halves are added up, as LLVM adds up lanes.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        parts, width = cgutils.unpack_tuple(builder, arguments[2]), LANES
+        two = (cgutils.unpack_tuple(builder, vectors) for vectors in arguments[2:])
+        parts, width = [builder.fadd(*pair) for pair in zip(*two, strict=True)], LANES
 
         def half(pair: Any, is_upper: bool) -> Any:
             lanes = [i for i in range(2 * LANES) if (2 * (i % width) >= width) == is_upper]
@@ -173,10 +205,10 @@ def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
         builder.store(parts[0], pointer, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, vectors), generate
+    return types.void(array, types.intp, vectors, others), generate
 
 
-def _on_all_lanes(builder: Any, number: Any) -> Any:
+def on_all_lanes(builder: Any, number: Any) -> Any:
     empty = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
     first = builder.insert_element(empty, number, ir.Constant(ir.IntType(32), 0))
     return _shuffle(builder, first, first, [0] * LANES)
@@ -187,7 +219,7 @@ def splat(typing: Any, number: Any) -> Any:
     """Put one number on all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _on_all_lanes(builder, *arguments)
+        return on_all_lanes(builder, *arguments)
 
     return Vector(number)(number), generate
 
@@ -198,7 +230,7 @@ def load_splat(typing: Any, array: Any, offset: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        return _on_all_lanes(builder, builder.load(builder.gep(data, [arguments[1]])))
+        return on_all_lanes(builder, builder.load(builder.gep(data, [arguments[1]])))
 
     return Vector(array.dtype)(array, types.intp), generate
 

@@ -48,7 +48,7 @@ def random_features(W, n, d, seed=0):
 @given(
     W=st.integers(1, 15),
     n=st.sampled_from([0, 1, 15, 16, 17, 255, 256, 257]),
-    d=st.sampled_from([1, 5, 16, 100]),
+    d=st.sampled_from([1, 5, 16, 64, 100]),
     strategy=st.sampled_from(['adaptive', 'vanilla', 'rigid']),
     data=st.data(),
 )

@@ -169,7 +169,7 @@ class CpuMatcher:
     def _without_dtw(self, queries: Any, x: int, weights: np.ndarray) -> np.ndarray:
         """Return the distances of image x by the other strategies, (n,)."""
         W, n = self._weights.shape
-        d = np.empty((-(-W // dot.TILE) * dot.TILE, W, n), np.float32)
+        d = np.empty((-(-W // int8.TILE) * int8.TILE, W, n), np.float32)
         dot.strip_distances(self._map, queries, x, d)
         if self._spatial.strategy == 'sliding_window':
             return image_distances(d[:W], self._spatial)

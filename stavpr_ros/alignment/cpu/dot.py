@@ -14,11 +14,20 @@ from numba.extending import overload
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.dtw import align_lanes, shift_lanes, SLOT
+from stavpr_ros.alignment.cpu.int8 import NEAR, TILE
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
-from stavpr_ros.simd import LANES, LINE, load, prefetch, splat, store, store_sums
+from stavpr_ros.simd import (
+    add_products,
+    LANES,
+    LINE,
+    load,
+    prefetch,
+    splat,
+    store,
+    store_sums,
+)
 
-TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
 AHEAD = 2048  # numbers of the map that are on their way to the cache
 FEW_IMAGES = 64  # map images likewise, where the distances of all cells are kept
@@ -54,37 +63,29 @@ def _dots(y, q, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = s0, s1, s2, s3, s4, s5, s6
 
 
-@reassociating_kernel
-def _dots_of_two(y, z, q, sums):
+@kernel
+def _dots_of_two(y, z, query, base, zeros, sums):
     """
-    Multiply two map strips (d,) by TILE query strips (TILE, d), in 31 of 32 registers.
+    Multiply two map strips (d,) by as many query strips, from ``base``, as there are zeros.
 
-    The order of the sums is LLVM's in :func:`_dots`: even and odd vectors apart.
+    With TILE they take 31 of 32 registers. The order of the sums is LLVM's in :func:`_dots`: even
+    and odd vectors apart.
 
     :param sums: (2 LANES,), written: of y, and from LANES on, of z; d is a multiple of 2 LANES.
     """
-    q0, q1, q2, q3, q4, q5, q6 = q[0], q[1], q[2], q[3], q[4], q[5], q[6]
-    a0 = a1 = a2 = a3 = a4 = a5 = a6 = b0 = b1 = b2 = b3 = b4 = b5 = b6 = splat(np.float32(0))
-    e0 = e1 = e2 = e3 = e4 = e5 = e6 = f0 = f1 = f2 = f3 = f4 = f5 = f6 = splat(np.float32(0))
-    for t in range(0, y.shape[0], 2 * LANES):
-        v, w, x = load(y, t), load(z, t), load(q0, t)
-        a0, b0, x = a0 + x * v, b0 + x * w, load(q1, t)
-        a1, b1, x = a1 + x * v, b1 + x * w, load(q2, t)
-        a2, b2, x = a2 + x * v, b2 + x * w, load(q3, t)
-        a3, b3, x = a3 + x * v, b3 + x * w, load(q4, t)
-        a4, b4, x = a4 + x * v, b4 + x * w, load(q5, t)
-        a5, b5, x = a5 + x * v, b5 + x * w, load(q6, t)
-        a6, b6, u = a6 + x * v, b6 + x * w, t + LANES
-        v, w, x = load(y, u), load(z, u), load(q0, u)
-        e0, f0, x = e0 + x * v, f0 + x * w, load(q1, u)
-        e1, f1, x = e1 + x * v, f1 + x * w, load(q2, u)
-        e2, f2, x = e2 + x * v, f2 + x * w, load(q3, u)
-        e3, f3, x = e3 + x * v, f3 + x * w, load(q4, u)
-        e4, f4, x = e4 + x * v, f4 + x * w, load(q5, u)
-        e5, f5, x = e5 + x * v, f5 + x * w, load(q6, u)
-        e6, f6 = e6 + x * v, f6 + x * w
-    store_sums(sums, 0, (a0 + e0, a1 + e1, a2 + e2, a3 + e3, a4 + e4, a5 + e5, a6 + e6))
-    store_sums(sums, LANES, (b0 + f0, b1 + f1, b2 + f2, b3 + f3, b4 + f4, b5 + f5, b6 + f6))
+    even_y = even_z = odd_y = odd_z = zeros
+    d = y.shape[0]
+    for t in range(0, d, 2 * LANES):
+        u = t + LANES
+        for strip in (y, z):  # processors stop at a page's end
+            prefetch(strip, t + AHEAD)
+            prefetch(strip, u + AHEAD)
+        even_y = add_products(even_y, query, base + t, d, load(y, t))
+        even_z = add_products(even_z, query, base + t, d, load(z, t))
+        odd_y = add_products(odd_y, query, base + u, d, load(y, u))
+        odd_z = add_products(odd_z, query, base + u, d, load(z, u))
+    store_sums(sums, 0, even_y, odd_y)
+    store_sums(sums, LANES, even_z, odd_z)
 
 
 @reassociating_kernel
@@ -113,33 +114,45 @@ def cosine_distances(features, queries, out):
                 out[x, y] = np.float32(1) - dot_product(features[y], queries[x])
 
 
-def _block_distances(features, queries, x, first, count, d):
-    """Fill d (rows, W, .): strips of query x against ``count`` map images from ``first``."""
+def _block_distances(features, queries, x, first, count, xi, d):
+    """
+    Fill d (rows, W, .): strips of query x against ``count`` map images from ``first``.
+
+    :param xi: only distances of strips i and j with ``|i - j| < xi`` are needed.
+    """
 
 
 @overload(_block_distances)
-def _overload_block_distances(features, queries, x, first, count, d):
+def _overload_block_distances(features, queries, x, first, count, xi, d):
     if isinstance(features, types.Array):
         return _float_block_distances.py_func
     return int8.block_distances.py_func
 
 
 @kernel
-def _float_block_distances(features, queries, x, first, count, d):
+def _float_block_distances(features, queries, x, first, count, xi, d):
     query, sums, step = queries[x], np.empty(2 * LANES + TILE, np.float32), 1
+    flat, D = query.reshape(-1), query.shape[1]
     if LANES == 16 and features.shape[2] % (2 * LANES) == 0:  # with 32 registers
         step = 2
+    zero = splat(np.float32(0))
+    few = zero, zero, zero, zero, zero
     for j in range(features.shape[0]):
+        low = int8.first_near(j, xi, query.shape[0]) if step == 2 else -1
         for y in range(0, count, step):
             place, other = features[j, first + y], features[j, first + min(y + 1, count - 1)]
-            for t in range(0, step * features.shape[2], LINE):  # processors stop at a page's end
-                prefetch(place, t + AHEAD)
-            for i in range(0, query.shape[0], TILE):
-                if step == 2:
-                    _dots_of_two(place, other, query[i : i + TILE], sums)
+            for i in range(max(low, 0), query.shape[0], TILE):
+                rows = TILE
+                if low >= 0:
+                    rows = NEAR
+                    _dots_of_two(place, other, flat, i * D, few, sums)
+                elif step == 2:
+                    _dots_of_two(place, other, flat, i * D, (*few, zero, zero), sums)
                 else:
+                    for t in range(0, D, LINE):
+                        prefetch(place, t + AHEAD)
                     _dots(place, query[i : i + TILE], sums)
-                for t in range(TILE):
+                for t in range(rows):
                     d[i + t, j, y] = np.float32(1) - sums[t]
                     if step == 2 and y + 1 < count:
                         d[i + t, j, y + 1] = np.float32(1) - sums[LANES + t]
@@ -161,7 +174,7 @@ def strip_distances(features, queries, x, d):
         first = block * IMAGES
         count = min(IMAGES, n - first)
         part = np.empty((d.shape[0], d.shape[1], IMAGES), np.float32)
-        _block_distances(features, queries, x, first, count, part)
+        _block_distances(features, queries, x, first, count, d.shape[0], part)
         d[:, :, first : first + count] = part[:, :, :count]
 
 
@@ -169,7 +182,7 @@ def strip_distances(features, queries, x, d):
 def _align_block(features, queries, x, first, count, weights, xi, is_rigid, d, edge, lanes):
     """Write the image distances of query x to ``count`` map images from ``first`` into lanes."""
     W, stride = d.shape[1], d.shape[2]
-    _block_distances(features, queries, x, first, count, d)
+    _block_distances(features, queries, x, first, count, xi, d)
     for at in range(0, count, LANES):
         if is_rigid:
             distances = shift_lanes(d.reshape(-1), at, W * stride, stride, W, xi)
@@ -226,7 +239,7 @@ def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
         lanes = np.empty(FEW_IMAGES, np.float32)
         cells, flat = d.reshape(-1), strips.reshape(-1)
         for x in range(queries.shape[0]):
-            _block_distances(features, queries, x, first, count, d)
+            _block_distances(features, queries, x, first, count, rows, d)
             for at in range(0, count, LANES):
                 for i in range(W):
                     for j in range(max(0, i - xi + 1), min(W, i + xi)):

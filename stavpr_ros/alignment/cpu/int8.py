@@ -19,17 +19,29 @@ from typing import Any
 
 from llvmlite import ir
 import numba as nb
-from numba.core import types
+from numba.core import cgutils, types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 import numpy as np
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
-from stavpr_ros.simd import LANES, load, load_splat, splat, store, Vector
+from stavpr_ros.simd import (
+    LANES,
+    load,
+    load_splat,
+    on_all_lanes,
+    prefetch,
+    splat,
+    store,
+    store_all,
+    Vector,
+)
 
-TILE = 7  # query strips whose sums stay in registers
+TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
+NEAR = 5  # of them, where a strip of the map is compared with the nearest ones only
 QUAD = 4  # dimensions of a lane
 IMAGES = 256  # places a thread takes at a time; a multiple of LANES
+AHEAD = 4096  # numbers of 32 bits of the map that are on their way to the cache
 MAX_LENGTH = 181.0  # norm of a rounded strip
 MAP_PEAK, QUERY_PEAK = 127.0, 63.0
 
@@ -136,6 +148,22 @@ def _multiply_add(typing: Any, total: Any, places: Any, query: Any) -> Any:
         return write_multiply_add(builder, INSTRUCTION, *arguments)
 
     return WHOLE(WHOLE, WHOLE, WHOLE), generate
+
+
+@intrinsic
+def _multiply_add_all(typing: Any, totals: Any, places: Any, query: Any, first: Any) -> Any:
+    """Add four products to each lane of totals, of one query strip each, from ``first`` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        sums, four = cgutils.unpack_tuple(builder, arguments[0]), arguments[1]
+        data = context.make_array(query)(context, builder, arguments[2]).data
+        for i, total in enumerate(sums):
+            at = builder.add(arguments[3], ir.Constant(arguments[3].type, i))
+            own = on_all_lanes(builder, builder.load(builder.gep(data, [at])))
+            sums[i] = write_multiply_add(builder, INSTRUCTION, total, four, own)
+        return context.make_tuple(builder, signature.return_type, sums)
+
+    return totals(totals, places, query, types.intp), generate
 
 
 @intrinsic
@@ -319,34 +347,31 @@ def tile(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @kernel
-def _tile_sums(values, at, quads, query, base, sums):
-    """Write sums of LANES places, from ``at``, with TILE query strips, from ``base``."""
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = splat(np.int32(0))
-    for t in range(quads):
-        places, at_query = load(values, at + t * LANES), base + t * TILE
-        s0 = _multiply_add(s0, places, load_splat(query, at_query))
-        s1 = _multiply_add(s1, places, load_splat(query, at_query + 1))
-        s2 = _multiply_add(s2, places, load_splat(query, at_query + 2))
-        s3 = _multiply_add(s3, places, load_splat(query, at_query + 3))
-        s4 = _multiply_add(s4, places, load_splat(query, at_query + 4))
-        s5 = _multiply_add(s5, places, load_splat(query, at_query + 5))
-        s6 = _multiply_add(s6, places, load_splat(query, at_query + 6))
-    store(sums, 0, s0)
-    store(sums, LANES, s1)
-    store(sums, 2 * LANES, s2)
-    store(sums, 3 * LANES, s3)
-    store(sums, 4 * LANES, s4)
-    store(sums, 5 * LANES, s5)
-    store(sums, 6 * LANES, s6)
+def first_near(j, xi, rows):
+    """Return the first of NEAR query strips i with ``|i - j| < xi``; -1 = all are compared."""
+    if 2 * xi - 1 > NEAR or rows != TILE:
+        return -1
+    return min(max(j - NEAR // 2, 0), TILE - NEAR)
 
 
 @kernel
-def block_distances(features, queries, x, first, count, d):
+def _row_sums(values, at, quads, query, base, zeros, sums):
+    """Write sums of LANES places, from ``at``, with as many query strips as there are zeros."""
+    totals = zeros
+    for t in range(quads):
+        prefetch(values, at + t * LANES + AHEAD)
+        totals = _multiply_add_all(totals, load(values, at + t * LANES), query, base + t * TILE)
+    store_all(sums, totals)
+
+
+@kernel
+def block_distances(features, queries, x, first, count, xi, d):
     """
     Fill d (rows, W, .), contiguous: strips of query x against ``count`` places from ``first``.
 
     :param features: result of :meth:`Int8Strips.kernel_arguments`; queries: of :func:`tile`.
     :param first: a multiple of LANES; count: rounded up to whole lanes, which d has room for.
+    :param xi: only distances of strips i and j with ``|i - j| < xi`` are needed.
     """
     values, reciprocals = features
     packed, query_reciprocals, query_sums = queries
@@ -354,14 +379,21 @@ def block_distances(features, queries, x, first, count, d):
     flat, query = values.reshape(-1), packed[x].reshape(-1)
     lengths, out = reciprocals.reshape(-1), d.reshape(-1)
     sums = np.empty(TILE * LANES, np.int32)
-    one = splat(np.float32(1))
+    zero, one = splat(np.int32(0)), splat(np.float32(1))
+    few = zero, zero, zero, zero, zero
     for j in range(W):
+        low = first_near(j, xi, d.shape[0])
         for y in range(0, count, LANES):
             group = j * groups + (first + y) // LANES
             length = load(lengths, group * LANES)
-            for i in range(0, d.shape[0], TILE):
-                _tile_sums(flat, group * quads * LANES, quads, query, i * quads, sums)
-                for t in range(TILE):
+            for i in range(max(low, 0), d.shape[0], TILE):
+                rows, at = TILE, group * quads * LANES
+                if low >= 0:
+                    rows = NEAR
+                    _row_sums(flat, at, quads, query, i, few, sums)
+                else:
+                    _row_sums(flat, at, quads, query, i * quads, (*few, zero, zero), sums)
+                for t in range(rows):
                     whole = _total(load(sums, t * LANES), splat(query_sums[x, i + t]))
                     cosine = whole * length * splat(query_reciprocals[x, i + t])
                     store(out, ((i + t) * W + j) * d.shape[2] + y, one - cosine)
