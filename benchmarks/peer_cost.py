@@ -3,15 +3,17 @@
 """
 Time of matching an image, by methods of one image and of sequences, and how many are right.
 
-``python benchmarks/peer_cost.py``: one thread; features ``gradient``, small images of SeqSLAM, and
-descriptors of ORB are there before the clock starts. ``right`` is the share of the images of
-Gardens Point, right side by day on the left side, whose nearest place is at most two away.
+``python benchmarks/peer_cost.py``: processor time of one thread; features ``gradient``, small images of SeqSLAM, and
+descriptors of ORB have a column of their own, and a row the network of ``hybrid`` alone. ``right``
+is the share of the images of Gardens Point, right side by day on the left side, whose nearest
+place is at most two away.
 """
 
 from collections.abc import Callable
 from functools import partial
-from itertools import count
+from itertools import count, cycle
 import sys
+import time
 from typing import Any, NamedTuple
 
 from accuracy import identity, short_cases
@@ -33,11 +35,13 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.threads import limit_threads
-from timing import measure, timed_job
+import timing
 
 SIZES = 2_000, 20_000  # places
 WINDOW, TOLERANCE = 20, 2
 ORB_FEATURES, ORB_RATIO = 300, 0.8  # Lowe's ratio test
+NETWORK = 'efficientnet_lite1'
+timed_job = partial(timing.timed_job, clock=time.process_time)
 
 
 class Drive(NamedTuple):
@@ -146,6 +150,19 @@ def methods(places: Drive, query: Drive) -> dict[str, Method]:
     }
 
 
+def time_features(images: list[np.ndarray]) -> dict[str, float]:
+    """Return the milliseconds that the features of an image take, by the method or the kind."""
+    orb, settings, views = cv2.ORB_create(ORB_FEATURES), SeqSlamSettings(), cycle(images)
+    gradient, network = (FeatureExtractor(kind) for kind in ('gradient', NETWORK))
+    jobs = {
+        'ORB': timed_job(lambda: orb.detectAndCompute(next(views), None)),
+        'SeqSLAM': timed_job(lambda: preprocess([next(views)], settings)),
+        'gradient': timed_job(lambda: gradient.extract([next(views)])),
+        NETWORK: timed_job(lambda: network.extract([next(views)])),
+    }
+    return {kind: 1e3 * times.median_s for kind, times in timing.measure(jobs, 4.0).items()}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     options = options_parser(__doc__, f'{SIZES[0]} places').parse_args(arguments)
@@ -160,6 +177,11 @@ def main(arguments: list[str] | None = None) -> int:
         counted = slice(WINDOW // 2, N - WINDOW // 2)  # in the middle of a window
         right = float(truth.accepts(np.maximum(matches, 0))[counted].mean())
         rows[name] = {'method': name, 'images': method.images, 'right': round(right, 3)}
+    features = time_features([frame.image for frame in case.query])
+    for name, row in rows.items():
+        own = next((kind for kind in features if name.startswith(kind)), 'gradient')
+        row['ms_features'] = round(features[own], 3)
+    rows[NETWORK] = {'method': NETWORK, 'images': 1, 'ms_features': round(features[NETWORK], 3)}
     for n in SIZES[:1] if options.quick else SIZES:
         ready = methods(places.repeat(n, np.random.default_rng(0)), query)
         numbers = {name: count() for name in ready}
@@ -169,16 +191,20 @@ def main(arguments: list[str] | None = None) -> int:
 
         jobs = {name: timed_job(partial(match, name, method)) for name, method in ready.items()}
         slow = {name: job for name, job in jobs.items() if name.startswith('ORB')}
-        for name, timing in {
-            **measure({name: job for name, job in jobs.items() if name not in slow}, 8.0),
-            **measure(slow, 1.0),
+        for name, times in {
+            **timing.measure({name: job for name, job in jobs.items() if name not in slow}, 8.0),
+            **timing.measure(slow, 1.0),
         }.items():
-            rows[name][f'ms_{n}'] = round(1e3 * timing.median_s, 3)
+            rows[name][f'ms_{n}'] = round(1e3 * times.median_s, 3)
         print(f'{n} places done', flush=True)
-    sizes = [key for key in next(iter(rows.values())) if key.startswith('ms_')]
-    head = ['method', 'images', *(f'ms, {int(key[3:]):,} places' for key in sizes), 'right']
+    keys = [
+        'images',
+        *(key for key in next(iter(rows.values())) if key.startswith('ms_')),
+        'right',
+    ]
+    head = ['method', *(key.replace('ms_', 'ms, ').replace('000', ',000 places') for key in keys)]
     cells = [
-        [name, str(row['images']), *(f'{row[key]:.3g}' for key in sizes), f'{row["right"]:.3f}']
+        [name, *(f'{row[key]:.3g}' if key in row else '' for key in keys)]
         for name, row in rows.items()
     ]
     print('\n'.join(table(head, cells)))
