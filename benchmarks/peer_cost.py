@@ -3,10 +3,10 @@
 """
 Time of matching an image, by methods of one image and of sequences, and how many are right.
 
-``python benchmarks/peer_cost.py``: processor time of one thread; features ``gradient``, small images of SeqSLAM, and
-descriptors of ORB have a column of their own, and a row the network of ``hybrid`` alone. ``right``
-is the share of the images of Gardens Point, right side by day on the left side, whose nearest
-place is at most two away.
+``python benchmarks/peer_cost.py``: processor time of one thread; features ``gradient``, small
+images of SeqSLAM and descriptors of ORB have a column of their own, and the network of ``hybrid``
+alone a row. ``right`` is the share of the images of Gardens Point, right side by day on the left
+side, whose nearest place is at most two away.
 """
 
 from collections.abc import Callable
@@ -197,14 +197,12 @@ def main(arguments: list[str] | None = None) -> int:
         }.items():
             rows[name][f'ms_{n}'] = round(1e3 * times.median_s, 3)
         print(f'{n} places done', flush=True)
-    keys = [
-        'images',
-        *(key for key in next(iter(rows.values())) if key.startswith('ms_')),
-        'right',
-    ]
-    head = ['method', *(key.replace('ms_', 'ms, ').replace('000', ',000 places') for key in keys)]
+    texts = {'images': 'images', 'ms_features': 'ms, features'}
+    texts |= {f'ms_{n}': f'ms, {n:,} places' for n in SIZES if f'ms_{n}' in rows['SeqSLAM']}
+    texts['right'] = 'right'
+    head = ['method', *texts.values()]
     cells = [
-        [name, *(f'{row[key]:.3g}' if key in row else '' for key in keys)]
+        [name, *(f'{row[key]:.3g}' if key in row else '' for key in texts)]
         for name, row in rows.items()
     ]
     print('\n'.join(table(head, cells)))
