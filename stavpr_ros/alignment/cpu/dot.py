@@ -71,7 +71,7 @@ def _dots_of_two(y, z, query, base, zeros, sums):
     With TILE they take 31 of 32 registers. The order of the sums is LLVM's in :func:`_dots`: even
     and odd vectors apart.
 
-    :param sums: (2 LANES,), written: of y, and from LANES on, of z; d is a multiple of 2 LANES.
+    :param sums: (2 LANES,), written: of y, and from LANES on, of z; d is a multiple of LANES.
     """
     even_y = even_z = odd_y = odd_z = zeros
     d = y.shape[0]
@@ -82,8 +82,9 @@ def _dots_of_two(y, z, query, base, zeros, sums):
             prefetch(strip, u + AHEAD)
         even_y = add_products(even_y, query, base + t, d, load(y, t))
         even_z = add_products(even_z, query, base + t, d, load(z, t))
-        odd_y = add_products(odd_y, query, base + u, d, load(y, u))
-        odd_z = add_products(odd_z, query, base + u, d, load(z, u))
+        if u < d:
+            odd_y = add_products(odd_y, query, base + u, d, load(y, u))
+            odd_z = add_products(odd_z, query, base + u, d, load(z, u))
     store_sums(sums, 0, even_y, odd_y)
     store_sums(sums, LANES, even_z, odd_z)
 
@@ -133,7 +134,7 @@ def _overload_block_distances(features, queries, x, first, count, xi, d):
 def _float_block_distances(features, queries, x, first, count, xi, d):
     query, sums, step = queries[x], np.empty(2 * LANES + TILE, np.float32), 1
     flat, D = query.reshape(-1), query.shape[1]
-    if LANES == 16 and features.shape[2] % (2 * LANES) == 0:  # with 32 registers
+    if LANES == 16 and features.shape[2] % LANES == 0:  # with 32 registers
         step = 2
     zero = splat(np.float32(0))
     few = zero, zero, zero, zero, zero
