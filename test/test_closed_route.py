@@ -14,7 +14,7 @@ from stavpr_ros.commands import build_map
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.maintenance.same_places import with_seam
+from stavpr_ros.maintenance.same_places import with_laps, with_seam
 from stavpr_ros.mapping import load_map, merge_maps, save_map, select_places
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.settings import RobustOptions
@@ -185,6 +185,32 @@ def test_end_of_a_closed_route_shows_its_start(closed_map):
 def test_other_routes_stay_as_they_are(end):
     place_map = map_of(laps(0, end, 0.6, 1))
     assert with_seam(place_map) is place_map
+
+
+@pytest.mark.parametrize(
+    ('end', 'bounds'), [(2 * LAP, [LAP]), (3 * LAP + 90, [LAP, 2 * LAP, 3 * LAP])]
+)
+def test_each_lap_of_a_recording_becomes_a_session(end, bounds):
+    """The same images on a map of one session have two places each, and few are matched."""
+    recording, query = map_of(laps(0, end, 0.6, 1)), laps(60, LAP + 60, 0.8, 2)
+    divided = with_laps(recording)
+    begins = np.flatnonzero(np.diff(divided.session_index)) + 1
+    np.testing.assert_allclose(begins, bounds, atol=2)
+    assert [session.name for session in divided.sessions][:2] == ['lap 1', 'lap 2']
+    accepted = [
+        sum(match.accepted for match in recognize(place_map, query, LAP_FORWARD))
+        for place_map in (divided, recording)
+    ]
+    assert accepted[0] > 90 > 2 * accepted[1]
+
+
+@pytest.mark.parametrize('repeats', ['nothing', 'a part', 'the start'])
+def test_routes_without_laps_stay_as_they_are(repeats, open_map):
+    strips = route_strips(3, 300)
+    if repeats == 'a part':  # a street that the route passes twice
+        strips[:, 230:280] = strips[:, 100:150]
+    place_map = open_map if repeats == 'the start' else map_of(features_of(strips, 0.6, 1))
+    assert with_laps(place_map) is place_map
 
 
 def test_route_may_be_stated_to_be_closed():

@@ -294,6 +294,8 @@ def _report(place_map: 'Map', output: str) -> None:
     megabytes = Path(output).stat().st_size / 1e6
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
     say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+    if laps := len(place_map.sessions):
+        say(f'the recording repeats its route: {laps} laps became a session each')
     if place_map.seam is not None:
         say(f'the route is closed: its last place shows place {place_map.seam}')
 
@@ -330,14 +332,17 @@ def main(args: list[str] | None = None) -> int:
         if len(arguments.input) > 1:
             return _build_each(arguments, sys.argv[1:] if args is None else args)
         arguments.input = arguments.input[0]
-        from stavpr_ros.maintenance.same_places import with_seam
+        from stavpr_ros.maintenance.same_places import with_laps, with_seam
         from stavpr_ros.mapping import save_map
         from stavpr_ros.prepare.prepared_map import statistics_of_map
 
         state = 'nothing was written; the same command continues the work'
         place_map, journal = _build(arguments)
+        is_small = len(place_map) <= MAX_SUGGESTED
+        if is_small:
+            place_map = with_laps(place_map)
         place_map = replace(place_map, threshold=_suggest_threshold(place_map, arguments))
-        if len(place_map) <= MAX_SUGGESTED:
+        if is_small:
             place_map = with_seam(place_map)
         statistics = statistics_of_map(place_map)
         save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)

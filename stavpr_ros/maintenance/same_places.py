@@ -13,7 +13,7 @@ import math
 import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import Map, select_places
+from stavpr_ros.mapping import Map, merge_maps, select_places
 from stavpr_ros.method.localizer import PlaceRecognizer
 from stavpr_ros.method.match import Match
 from stavpr_ros.method.model import MODEL
@@ -21,6 +21,7 @@ from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.progress import Progress
 
 SURE = 0.9  # probability above which two places are taken to be the same
+RELATED = 0.5  # part of the places of later laps that is related to earlier ones
 MAX_END = 60  # last places of a route, which are compared with its first ones
 
 
@@ -144,6 +145,33 @@ def with_seam(place_map: Map, is_closed: bool = False) -> Map:
     is_matched = (matched >= 0) & (end >= n - count)
     same_as[end[is_matched]] = matched[is_matched]
     return replace(place_map, same_as=same_as.astype(np.int32))
+
+
+def with_laps(place_map: Map) -> Map:
+    """
+    Return the map of a recording of several laps with a session for each; another map as it is.
+
+    Its places are driven, as a query of mode robust, on its first third: a lap begins where these
+    are matched again. Most places of the later laps must be matched to earlier ones.
+    """
+    n, bounds = len(place_map), [0]
+    if len(place_map.sessions) > 1 or n <= 3 * MAX_END:
+        return place_map
+    images = np.arange(MAX_END, n)
+    matched = recognize_places(select_places(place_map, np.arange(n // 3)), place_map, images)
+    begins = (images - matched)[matched >= 0]
+    for begin in begins[begins < n - MAX_END].tolist():
+        is_sure = (abs(begins - begin) < MAX_END // 2).sum() > SequenceSettings().length
+        shortest = bounds[1] // 2 if len(bounds) > 1 else MAX_END
+        if is_sure and begin > bounds[-1] + shortest:
+            bounds.append(begin)
+    laps = [np.arange(first, end) for first, end in pairwise([*bounds, n])]
+    if len(laps) == 1:
+        return place_map
+    names = [f'lap {number}' for number in range(1, len(laps) + 1)]
+    divided = with_same_places(merge_maps([select_places(place_map, lap) for lap in laps], names))
+    is_related = np.asarray(divided.same_as) < np.arange(n)
+    return divided if is_related[len(laps[0]) :].mean() > RELATED else place_map
 
 
 def recognize_places(reference: Map, drive: Map, images: np.ndarray) -> np.ndarray:
