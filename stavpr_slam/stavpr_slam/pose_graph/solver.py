@@ -168,9 +168,10 @@ def _add(A, scale, B, C):
 
 
 @kernel
-def _assemble(columns, both, starts, errors, jacobians, information, weights, blocks, gradient):
-    """Add up the normal equations, in the order of elimination."""
+def _assemble(columns, both, starts, rows, errors, jacobians, information, weights):
+    """Return the normal equations in the order of elimination, the matrix decomposed."""
     d = errors.shape[1]
+    blocks, gradient = np.zeros((len(rows), d, d)), np.zeros((len(starts) - 1, 1, d))
     product, pull = np.empty((d, d)), np.empty(d)
     for f in range(len(columns)):
         w = weights[f]
@@ -194,6 +195,7 @@ def _assemble(columns, both, starts, errors, jacobians, information, weights, bl
                         blocks[both[f], a, b] += product[a, b]
                     else:
                         blocks[both[f], b, a] += product[a, b]
+    return blocks, gradient, _decompose(starts, rows, blocks)
 
 
 @kernel
@@ -233,13 +235,14 @@ def _decompose(starts, rows, blocks):
     :returns: the logarithm of the determinant of the result; NaN = it is not positive definite.
     """
     d, determinant = blocks.shape[1], 0.0
+    pivot = np.empty((d, d))
     for j in range(len(starts) - 1):
         first, end = starts[j], starts[j + 1]
         determinant += _root(blocks[first])
         for p in range(first + 1, end):
             _divide(blocks, p, blocks, first)
         for p in range(first + 1, end):
-            own = starts[rows[p]]
+            own, pivot[:] = starts[rows[p]], blocks[p]
             for q in range(p, end):
                 while rows[own] < rows[q]:
                     own += 1
@@ -247,7 +250,7 @@ def _decompose(starts, rows, blocks):
                     for b in range(d):
                         total = 0.0
                         for c in range(d):
-                            total += blocks[q, a, c] * blocks[p, b, c]
+                            total += blocks[q, a, c] * pivot[b, c]
                         blocks[own, a, b] -= total
     return determinant
 
@@ -410,13 +413,11 @@ class Solver:
         self, weights: np.ndarray, count: int
     ) -> tuple[Pattern, np.ndarray, np.ndarray, float]:
         """Return the pattern, the blocks of the root, the right side, and its determinant."""
-        pattern, d = self._pattern(weights > 0, count), len(self.at)
-        blocks, gradient = np.zeros((len(pattern.rows), d, d)), np.zeros((count, 1, d))
-        _assemble(
-            pattern.columns, pattern.both, pattern.starts, self._errors, self._jacobians,
-            self._local, weights, blocks, gradient,
+        pattern = self._pattern(weights > 0, count)
+        return pattern, *_assemble(
+            pattern.columns, pattern.both, pattern.starts, pattern.rows, self._errors,
+            self._jacobians, self._local, weights,
         )  # fmt: skip
-        return pattern, blocks, gradient, _decompose(pattern.starts, pattern.rows, blocks)
 
     def innovations(
         self, count: int, weights: np.ndarray, chosen: np.ndarray, spread: np.ndarray | None = None
