@@ -68,17 +68,17 @@ def test_external_keyframes_near_returns_nearest_with_motion():
     keyframes = ExternalKeyframes(max_gap=2.0)
     at = lambda x: np.array([x, 0, 0, 0, 0, 0, 1.0])  # noqa: E731
     keyframes.odometry.add(SECOND, at(1.0))
-    keyframes.add(3 * SECOND // 2, 5)  # before the odometry after it
+    keyframes.numbers[3 * SECOND // 2] = 5  # before the odometry after it
     assert keyframes.near(2 * SECOND) is None
     for second in (2, 3, 4, 5, 6, 7):
         keyframes.odometry.add(second * SECOND, at(second))
-    keyframes.add(4 * SECOND, 6)
+    keyframes.numbers[4 * SECOND] = 6
     number, motion = keyframes.near(2 * SECOND)
     assert number == 5
     np.testing.assert_allclose(motion[:3, 3], [0.5, 0, 0])
     assert keyframes.near(3 * SECOND)[0] == 6
     assert keyframes.near(7 * SECOND) is None  # 3 s away
-    keyframes.add(9 * SECOND, 7)
+    keyframes.numbers[9 * SECOND] = 7
     assert keyframes.near(9 * SECOND)[0] == 7  # the same stamp: no motion
     assert keyframes.near(17 * SECOND // 2) is None  # without odometry
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 import gc
-import math
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -20,6 +19,7 @@ from rclpy.qos import QoSProfile
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
+from stavpr_ros.checks import require_above, require_at_least
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
@@ -104,11 +104,9 @@ class PoseGraphNode(ManagedNode):
         self._appearance = bool(values['appearance_edges'])
         self._folder = maps_folder(values['maps_folder'])
         for name in ('keyframe_distance', 'max_odometry_gap'):
-            if not (math.isfinite(values[name]) and values[name] > 0):
-                raise SettingsError(f'{name} = {values[name]}: expected a number above 0')
+            require_above(name, values[name], 0)
         self._speed, self._robots = values['max_correction_speed'], list(values['robots'])
-        if not (math.isfinite(self._speed) and self._speed >= 0):
-            raise SettingsError(f'max_correction_speed = {self._speed}: expected 0 or more m/s')
+        require_at_least('max_correction_speed', self._speed, 0, 'm/s')
         if len({*self._robots}) < max(len(self._robots), 1):
             raise SettingsError(f'robots = {self._robots}: expected different names, or one ""')
         gc.freeze()  # collecting what is imported would take .15 s, without any odometry
