@@ -60,7 +60,7 @@ class Beliefs:
         Return these with the best factor on all errors, in parts of the last one.
 
         :param rows: innovations of closures.
-        :param runs: numbers of their runs of nodes; those of a run count as one.
+        :param runs: numbers of their runs of nodes; all closures of a run count as one.
         """
         weights = weights_in_runs(runs)
         factors = np.array([1.0, *factors])
@@ -89,13 +89,13 @@ class MeasuredSolution(Solution):
 
 
 def weights_in_runs(runs: np.ndarray) -> np.ndarray:
-    """Return weights of closures by which those of a run of nodes count as one, (n,)."""
+    """Return weights by which all closures of a run of nodes count as one, (n,)."""
     numbers = np.unique(runs, return_inverse=True)[1]
     return np.asarray(1 / np.bincount(numbers)[numbers])
 
 
 def are_certain(odds: np.ndarray, runs: np.ndarray) -> bool:
-    """Return whether closures are certain together, those of a run as one, by their odds."""
+    """Return whether closures are certain together, where a run counts as one, by their odds."""
     return bool(weights_in_runs(runs) @ odds > tuning.CERTAIN)
 
 
@@ -172,7 +172,7 @@ class _Blocks:
         Decide on the closures of a block.
 
         :param own: numbers of all closures up to its end.
-        :param new: those of them that are new, bool.
+        :param new: which of them are new, bool.
         :param swaps: leave out weak ones on trial.
         """
         self._own = own

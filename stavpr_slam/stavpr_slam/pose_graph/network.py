@@ -163,7 +163,7 @@ class Network:
         return int(self._variables[worst]), float(deviations[worst])
 
     def _step(self, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the variables after a step from those of the last residuals."""
+        """Return the variables after a step from where the residuals were computed at last."""
         whole = np.concatenate([np.ones(len(values)), weights * (weights > NONE)])
         return self._solver.step(values, whole)
 

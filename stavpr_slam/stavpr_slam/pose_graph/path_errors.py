@@ -54,7 +54,7 @@ def message_growth(
     Return how far covariances of messages grow in a step, in the axes of the start, (6, 6).
 
     :param before, after: as in ``geometry_msgs/PoseWithCovariance``, shape (6, 6).
-    :returns: None where they are unknown, or do not grow as those of a filter.
+    :returns: None where they are unknown, or do not grow as a filter's do.
     """
     if before is None or after is None:
         return None

@@ -298,7 +298,7 @@ def _covariances(starts, rows, blocks, columns, jacobians, result):
         for a in range(d):
             x[second, a, a] = 1.0
         while min(first, second) < count:
-            # the columns that a column fills are those of the ways to the last one
+            # a column fills the columns on the ways to the last one
             j = min(first, second)
             _forward(starts, rows, blocks, j, x)
             _add(result[f], 1.0, x[j], x[j].T)

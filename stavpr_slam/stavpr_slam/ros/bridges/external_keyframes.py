@@ -14,7 +14,7 @@ class ExternalKeyframes:
     """
     Keyframes by their stamps, and the odometry between them.
 
-    ``numbers`` are those of the keyframes by stamp, ns.
+    ``numbers`` has the keyframes by stamp, ns.
 
     :param max_gap: seconds between an image and its keyframe at most.
     """

@@ -18,7 +18,7 @@ class PoseBridge(Bridge):
     """
     Publishes the pose of the query in the frame of the map, by the place and the relative pose.
 
-    The covariance is that of the relative pose; the poses of the map count as exact.
+    The covariance is of the relative pose; the poses of the map count as exact.
     """
 
     TOPIC: ClassVar[str]

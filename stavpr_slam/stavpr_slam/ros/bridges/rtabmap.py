@@ -26,8 +26,8 @@ class RtabmapBridge(Bridge):
     """
     Adds loop closures to the graph of RTAB-Map as user closures, between its keyframes.
 
-    The nodes are those of ``rtabmap/info``: ``ref_id`` at ``header.stamp``. RTAB-Map checks the
-    graph with the new link (RGBD/OptimizeMaxError) and does not report the result.
+    ``rtabmap/info`` has the nodes: ``ref_id`` at ``header.stamp``. RTAB-Map checks the graph with
+    the new link (RGBD/OptimizeMaxError) and does not report the result.
     """
 
     NAME, IS_ON_MAP = 'rtabmap', False
@@ -83,7 +83,7 @@ class RtabmapBridge(Bridge):
         return ''
 
     def _send_pending(self) -> None:
-        """Request the links whose keyframes are known; those of later stamps wait."""
+        """Request the links whose keyframes are known; later ones wait."""
         if not self._client.service_is_ready():
             return
         waiting, newest = [], max(self._keyframes.numbers, default=0)
