@@ -162,17 +162,17 @@ class PoseGraphNode(ManagedNode):
         """Subscribe."""
         result = super().on_activate(state)
         group = MutuallyExclusiveCallbackGroup()
-
-        def subscribe(kind: type, topic: str, use: Callable[..., None], qos: QoSProfile) -> None:
-            self._entities.append(
-                self.create_subscription(kind, topic, use, qos, callback_group=group)
+        topics: list[tuple[type, str, Callable[..., None], QoSProfile]] = [
+            (
+                Odometry,
+                f'{robot}/odom'.lstrip('/'),
+                partial(self._on_odometry, robot),
+                ODOMETRY_QOS,
             )
-
-        for robot in self._robots:
-            topic = f'{robot}/odom'.lstrip('/')
-            subscribe(Odometry, topic, partial(self._on_odometry, robot), ODOMETRY_QOS)
-        for topic in self._topics:
-            subscribe(LoopClosure, topic, self._on_closure, CLOSURE_QOS)
+            for robot in self._robots
+        ]
+        topics += [(LoopClosure, topic, self._on_closure, CLOSURE_QOS) for topic in self._topics]
+        self._entities = [self.create_subscription(*row, callback_group=group) for row in topics]
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -184,9 +184,8 @@ class PoseGraphNode(ManagedNode):
         """Forget the graph."""
         self._stop()
         self._forget()
-        for publisher in self._made_publishers:
-            self.destroy_publisher(publisher)
-        self._made_publishers = []
+        while self._made_publishers:
+            self.destroy_publisher(self._made_publishers.pop())
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -201,9 +200,8 @@ class PoseGraphNode(ManagedNode):
         super().destroy_node()
 
     def _unsubscribe(self) -> None:
-        for subscription in self._entities:
-            self.destroy_subscription(subscription)
-        self._entities = []
+        while self._entities:
+            self.destroy_subscription(self._entities.pop())
 
     def _stop(self) -> None:
         self._unsubscribe()
@@ -305,12 +303,11 @@ class PoseGraphNode(ManagedNode):
                 f'(evidence -{snapshot.values["evidence_against_correction"]})',
                 throttle_duration_sec=10.0,
             )
-        if snapshot.paths is not None and self.state == 'active':
-            trajectories, *edges = snapshot.paths
-            for robot, (stamps, *both) in trajectories.items():
+        if snapshot.trajectories and self.state == 'active':
+            for robot, (stamps, *both) in snapshot.trajectories.items():
                 for publisher, poses in zip(self._paths[robot], both, strict=True):
                     publisher.publish(path_bytes(self._frame, stamps, poses))
-            self._edges.publish(edge_markers(self._frame, *edges))
+            self._edges.publish(edge_markers(self._frame, *snapshot.edges))
 
     def _on_lost(self, problem: str) -> None:
         self._lost = self._problems['process'] = problem
