@@ -195,6 +195,18 @@ def test_odometry_that_is_interrupted_begins_a_session(tmp_path, freedom, missin
     assert f'{1 + len(missing)} sessions: the odometry is inter' in capsys.readouterr().out
 
 
+def test_session_that_only_a_later_one_joins(tmp_path):
+    """Closures join the third lap to both others, which no closure joins."""
+    edges, lap, T = read_edges(write(tmp_path / 'a.g2o', 3)), 4 * SIDE, truth(3)
+    starts = lap - 1, 2 * lap - 1
+    odometry = [edge for edge in edges if edge[1] == edge[0] + 1 and edge[0] not in starts]
+    pairs = [(i, i % lap + 2 * lap) for i in range(0, 2 * lap, 2)]
+    closures = [(i, j, inverse(T[i]) @ T[j], edges[-1][3]) for i, j in pairs]
+    graph = graph_of([*odometry, *closures])
+    assert error(to_poses(graph.update(final=True)), to_poses(T)) < 0.3
+    assert (graph.chain.sessions, graph.rejected < 5) == (3, True)
+
+
 def test_file_that_is_no_text_is_named(tmp_path):
     (tmp_path / 'a.g2o').write_bytes(b'\x1f\x8b\x08\0')
     with pytest.raises(InputError, match=r'a\.g2o is no text .*: decompress or convert it'):

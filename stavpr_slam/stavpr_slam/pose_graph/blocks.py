@@ -176,7 +176,12 @@ class _Blocks:
         :param swaps: leave out weak ones on trial.
         """
         self._own = own
-        self._network = Network(part, self._nodes, self._closures[own], self._placement.links)
+        links = {  # a session may be tied to a later one
+            node: link if link < len(part) else part.before(node)
+            for node, link in self._placement.links.items()
+            if node < len(part)
+        }
+        self._network = Network(part, self._nodes, self._closures[own], links)
         network, limit = self._network, self._network.limit * tuning.TAILS
         network.limit, network.room = limit, self._beliefs.space
         values, accepted = network.values(self._nodes), self._accepted[own]
