@@ -18,7 +18,7 @@ from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.sessions import extend, Pair, place, Placement, weak_pairs
-from stavpr_slam.pose_graph.solution import Solution
+from stavpr_slam.pose_graph.solution import NOTHING, Solution
 from stavpr_slam.pose_graph.solver import likelihoods, scale_errors, squares
 
 PASSES = False, True  # over the closures of a block: again for those that agree by now
@@ -125,14 +125,16 @@ class _Blocks:
         self._chain, self._closures, self._placement = chain, closures, placement
         self._latest = np.maximum(closures.query, closures.place)
         self._runs = self._latest // tuning.LONGEST  # whose closures may be wrong together
+        self._network = network = Network(chain, placement.initial, closures, placement.links)
+        width = 2 * network.freedom + 1
+        if isinstance(last, MeasuredSolution) and last.beliefs.innovations.shape[1] == width:
+            beliefs = last.beliefs
+        else:  # nothing, or in a plane that the odometry has left
+            last, beliefs = NOTHING, Beliefs(network.room, np.zeros((0, width)))
         count, old, self._nodes = len(closures), len(last.accepted), last.nodes
         self._is_old = np.arange(count) < old
         self._accepted = np.zeros(count, bool)
         self._accepted[:old] = last.accepted & placement.allowed[:old]
-        self._network = network = Network(chain, placement.initial, closures, placement.links)
-        beliefs = Beliefs(network.room, np.zeros((0, 2 * network.freedom + 1)))
-        if isinstance(last, MeasuredSolution):
-            beliefs = last.beliefs
         self._beliefs = beliefs.resize(network.room, count)
         self._searches = count > 0 and count >= tuning.SEARCH * beliefs.search_count
         if self._searches:
@@ -181,7 +183,8 @@ class _Blocks:
             for node, link in self._placement.links.items()
             if node < len(part)
         }
-        self._network = Network(part, self._nodes, self._closures[own], links)
+        freedom = self._network.freedom
+        self._network = Network(part, self._nodes, self._closures[own], links, freedom)
         network, limit = self._network, self._network.limit * tuning.TAILS
         network.limit, network.room = limit, self._beliefs.space
         values, accepted = network.values(self._nodes), self._accepted[own]

@@ -49,6 +49,7 @@ class Network:
     :param closures: n closures; ``query`` and ``place`` are their nodes, (n,).
     :param links: first node of each session: the node that it is tied to loosely; -1 = it is an
         anchor.
+    :param freedom: of poses, 3 = in the plane, or 6; None = by the odometry.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Network:
         initial: np.ndarray,
         closures: ClosureArrays,
         links: Mapping[int, int],
+        freedom: int | None = None,
     ) -> None:
         self._chain, self._links = chain, links
         self.query, self.place = closures.query, closures.place
@@ -64,10 +66,10 @@ class Network:
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
-        T = chain.transforms
-        self._is_planar = bool(np.ptp(T[:, 2, 3]) < FLAT and np.abs(T[:, 2, :2]).max() < FLAT)
-        at = np.array(PLANAR if self._is_planar else range(6))
-        self.freedom = len(at)
+        z, tilt = chain.transforms[:, 2, 3], chain.transforms[:, 2, :2]
+        is_planar = np.ptp(z) < FLAT and np.abs(tilt).max() < FLAT
+        self.freedom = freedom or (3 if is_planar else 6)
+        at = np.array(PLANAR if self.freedom == 3 else range(6))
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
         self.room = room(initial, self.freedom)
         self._loose_determinant = float(np.log(loose).sum() / 2)
