@@ -202,7 +202,7 @@ class PoseGraph:
         follows = not final and len(self._sources) <= tuning.SEARCH * self._searched
         if isinstance(last, DriveSolution) and follows:
             return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
-        for node in self.chain.splits[::-1]:
+        for node in [*self.chain.splits][::-1]:
             self._split(node, False)
         solution = without = decide_anew(*graph)
         for _ in range(tuning.MAX_BREAKS):
@@ -212,7 +212,7 @@ class PoseGraph:
             solution = better
         # where none is accepted without breaks, a few false runs agree with them
         if not without.accepted.any() and solution.accepted.sum() <= solution.rejected:
-            for node in self.chain.splits[::-1]:
+            for node in [*self.chain.splits][::-1]:
                 self._split(node, False)
             solution = without
         self._searched = len(self._sources)

@@ -60,7 +60,7 @@ class KeyframeChain:
         self.robots: list[str] = []
         self.sessions = 0
         self._fixed: dict[tuple[str, int], int] = {}
-        self._cuts: dict[int, int] = {}  # first nodes after splits, and the nodes before
+        self.splits: dict[int, int] = {}  # first nodes behind them, and the nodes before
         self.breaks: list[tuple[str, str]] = []  # robot and reason
 
     def __len__(self) -> int:
@@ -238,8 +238,8 @@ class KeyframeChain:
 
     def before(self, node: int) -> int:
         """Return the last keyframe of a robot before the first one of a session; -1 = none."""
-        if node in self._cuts:
-            return self._cuts[node]
+        if node in self.splits:
+            return self.splits[node]
         number = self.recording[node]
         robot, earlier = self._tracks[number].robot, self._tracks[:number]
         return next((own.nodes[-1] for own in reversed(earlier) if own.robot == robot), -1)
@@ -249,13 +249,13 @@ class KeyframeChain:
         later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
         self.sessions += 1
-        self._cuts[node] = before = int(self.previous[node])
+        self.splits[node] = before = int(self.previous[node])
         self.previous[node] = -1
         self._begin(node, int(self.stamps[[before, node]].mean()))
 
     def merge_session(self, node: int) -> None:
         """Undo the split at a node."""
-        end, before = self.session[node], self._cuts.pop(node)
+        end, before = self.session[node], self.splits.pop(node)
         self.session[self.session == end] = self.session[before]
         self.session[self.session > end] -= 1
         self.sessions -= 1
@@ -265,8 +265,3 @@ class KeyframeChain:
     def _begin(self, node: int, stamp: int) -> None:
         track = self._tracks[self.recording[node]]
         track.begins[track.nodes.index(node)] = stamp
-
-    @property
-    def splits(self) -> list[int]:
-        """Return the first nodes of sessions that began by a split."""
-        return list(self._cuts)

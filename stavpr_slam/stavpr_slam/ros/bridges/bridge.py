@@ -66,20 +66,14 @@ class Bridge(Node):
             name: self.declare_parameter(name, default).value
             for name, (default, _) in self.PARAMETERS.items()
         }
+        for name, value in self.given.items():
+            if isinstance(value, float):
+                require_above(name, value, 0)
         self.counts: Counter[str] = Counter()
         self.create_subscription(LoopClosure, 'stavpr/loop_closure', self._on_closure, CLOSURE_QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, self.on_timer, clock=steady)
-
-    def seconds(self, name: str) -> float:
-        """
-        Return a parameter.
-
-        :raises SettingsError: it is not a number above 0.
-        """
-        require_above(name, self.given[name], 0)
-        return float(self.given[name])
 
     def take(self, message: LoopClosure, closure: Closure) -> str:
         """Pass a valid closure on; return why it is not, empty = it is, or waits."""

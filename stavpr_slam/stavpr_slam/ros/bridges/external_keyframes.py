@@ -2,41 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """The keyframes of another back end: its loop closures are between those, not between images."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from stavpr_ros.mapping.transforms import cross, inverse, matrices
-from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
-from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
-from stavpr_slam.pose_graph.path_errors import OdometryNoise
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 
-class ExternalKeyframes:
+def nearest(
+    keyframes: Mapping[int, int], odometry: KeyframeChain, max_gap: int, stamp: int
+) -> tuple[int, np.ndarray] | None:
     """
-    Keyframes by their stamps, and the odometry between them.
+    Return the nearest keyframe, and the transform (4, 4) from it to a stamp (ns).
 
-    ``numbers`` has the keyframes by stamp, ns.
-
-    :param max_gap: seconds between an image and its keyframe at most.
+    :param keyframes: their numbers by stamp.
+    :param max_gap: ns between an image and its keyframe at most.
+    :returns: None without a keyframe that is near and whose motion to the stamp is known.
     """
-
-    def __init__(self, max_gap: float) -> None:
-        self._max_gap = round(max_gap * SECOND)
-        self.numbers: dict[int, int] = {}
-        self.odometry = KeyframeChain(ChainSettings(), OdometryNoise())
-
-    def near(self, stamp: int) -> tuple[int, np.ndarray] | None:
-        """
-        Return the nearest keyframe, and the transform (4, 4) from it to a stamp (ns).
-
-        :returns: None without a keyframe that is near and whose motion to the stamp is known.
-        """
-        best = min(self.numbers, key=lambda own: abs(own - stamp), default=stamp)
-        if best == stamp:
-            return (self.numbers[stamp], np.eye(4)) if self.numbers else None
-        motion = self.odometry.motion(best, stamp)
-        if abs(best - stamp) > self._max_gap or motion is None:
-            return None
-        return self.numbers[best], motion
+    if not keyframes:
+        return None
+    best = min(keyframes, key=lambda own: abs(own - stamp))
+    motion = odometry.motion(best, stamp) if best != stamp else np.eye(4)
+    if abs(best - stamp) > max_gap or motion is None:
+        return None
+    return keyframes[best], motion
 
 
 def keyframe_edge(

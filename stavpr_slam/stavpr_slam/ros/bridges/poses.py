@@ -75,7 +75,7 @@ class RobotLocalizationBridge(PoseBridge):
 
     def __init__(self) -> None:
         super().__init__()
-        self._gap = round(self.seconds('relocalization_gap') * SECOND)
+        self._gap = round(self.given['relocalization_gap'] * SECOND)
         self._last = -self._gap - 1
 
     def reason_to_skip(self, message: LoopClosure) -> str:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """RTAB-Map: edges by its service ``add_link``, or poses on a map by its topic ``global_pose``."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 from nav_msgs.msg import Odometry
@@ -10,10 +11,12 @@ from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import to_poses
 from stavpr_ros.ros.messages import nanoseconds, odometry_pose, transform_message
-from stavpr_slam.pose_graph import body_covariance, Closure
+from stavpr_ros.units import SECOND
+from stavpr_slam.pose_graph import body_covariance, ChainSettings, Closure, OdometryNoise
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.transforms import TRANSLATION_FIRST
 from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
-from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
+from stavpr_slam.ros.bridges.external_keyframes import keyframe_edge, nearest
 from stavpr_slam.ros.bridges.poses import PoseBridge
 from stavpr_slam.ros.graph_messages import ODOMETRY_QOS
 
@@ -46,7 +49,8 @@ class RtabmapBridge(Bridge):
         super().__init__()
         self._pending: list[Closure] = []
         self._sent: set[tuple[int, int]] = set()
-        self._keyframes = ExternalKeyframes(self.seconds('max_keyframe_gap'))
+        self._keyframes: dict[int, int] = {}  # numbers by stamp, ns
+        self._odometry = KeyframeChain(ChainSettings(), OdometryNoise())
         self._client = self.create_client(self._service, 'rtabmap/add_link')
         self.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
         self.create_subscription(self._messages.Info, 'rtabmap/info', self._on_info, 100)
@@ -55,18 +59,18 @@ class RtabmapBridge(Bridge):
         """Send what waited for RTAB-Map, and publish the diagnostics."""
         self._send_pending()
         self.counts['waiting'] = len(self._pending)
-        self.counts['keyframes'] = len(self._keyframes.numbers)
+        self.counts['keyframes'] = len(self._keyframes)
         super().on_timer()
 
     def _on_info(self, message: Any) -> None:
         stamp = nanoseconds(message.header.stamp)
         if message.ref_id > 0 and stamp > 0:
-            self._keyframes.numbers[stamp] = message.ref_id
+            self._keyframes[stamp] = message.ref_id
         self._send_pending()
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            self._keyframes.odometry.add(nanoseconds(message.header.stamp), odometry_pose(message))
+            self._odometry.add(nanoseconds(message.header.stamp), odometry_pose(message))
         except InputError as error:
             self.counts['invalid_odometry'] += 1
             self.get_logger().warning(f'odometry rejected: {error}', throttle_duration_sec=10.0)
@@ -86,12 +90,14 @@ class RtabmapBridge(Bridge):
         """Request the links whose keyframes are known; later ones wait."""
         if not self._client.service_is_ready():
             return
-        waiting, newest = [], max(self._keyframes.numbers, default=0)
+        waiting, newest = [], max(self._keyframes, default=0)
+        gap = round(self.given['max_keyframe_gap'] * SECOND)
+        near = partial(nearest, self._keyframes, self._odometry, gap)
         for closure in self._pending:
             if closure.query_stamp > newest:
                 waiting.append(closure)
                 continue
-            query, place = map(self._keyframes.near, (closure.query_stamp, closure.place_stamp))
+            query, place = map(near, (closure.query_stamp, closure.place_stamp))
             if query is None or place is None:
                 self.counts['no_keyframe'] += 1
             elif (place[0], query[0]) in self._sent or place[0] == query[0]:
