@@ -19,7 +19,7 @@ from stavpr_slam.pose_graph import tuning
 
 TINY = 1e-12  # twice the sine of an angle
 SMALL = 1e-5  # radians: of a rotation whose series are cut after two terms
-SERIES = 1e-2  # radians: the same of the derivative of the logarithm
+SERIES = 1e-2  # radians: the same of the logarithm and its derivative
 PATTERNS = 16  # that are kept
 ALONE = 1e-9  # least part of its errors that a factor leaves to others
 
@@ -32,26 +32,6 @@ def _between(a, b, result):
         for j in range(3):
             result[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
             result[i, 3] += a[j, i] * (b[j, 3] - a[j, 3])
-
-
-@kernel
-def _logarithm(T, twist):
-    """Write the logarithm of a transform, rotation first."""
-    x, y, z = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
-    length, trace = math.sqrt(x * x + y * y + z * z), T[0, 0] + T[1, 1] + T[2, 2]
-    angle = math.atan2(length, trace - 1)
-    if length < TINY and trace < 0:  # half a turn, about an axis that is not known
-        z = length = 1.0
-    factor = angle / length if length > TINY else 0.5
-    x, y, z = factor * x, factor * y, factor * z
-    half = angle / 2
-    rest = (1 - half / math.tan(half)) / angle**2 if angle > SMALL else 1 / 12
-    a, b, c = T[0, 3], T[1, 3], T[2, 3]
-    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
-    twist[0], twist[1], twist[2] = x, y, z
-    twist[3] = a - p / 2 + rest * (y * r - z * q)
-    twist[4] = b - q / 2 + rest * (z * p - x * r)
-    twist[5] = c - r / 2 + rest * (x * q - y * p)
 
 
 @kernel
@@ -83,32 +63,43 @@ def _move(poses, at, steps, result):
 
 
 @kernel
-def _derivative(twist, derivative):
+def _logarithm(T, twist, derivative):
     """
-    Write the derivative of the logarithm of a transform by a twist behind it, (6, 6).
+    Write the logarithm of a transform, rotation first, and its derivative by a twist behind it.
 
-    It is x / (1 - exp(-x)) of x = ad(twist): 1 + x / 2 + a x^2 + b x^4, since the eigenvalues of x
-    are 0 and +-i angle, each twice. The upper right block, which is 0, is not written.
+    The derivative is x / (1 - exp(-x)) of x = ad(twist): 1 + x / 2 + a x^2 + b x^4, since the
+    eigenvalues of x are 0 and +-i angle, each twice. Its block of the rotation, transposed, makes
+    the translation a twist. The upper right block, which is 0, is not written.
     """
     w, v = twist[:3], twist[3:]
-    square, both = w[0] ** 2 + w[1] ** 2 + w[2] ** 2, v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+    w[0], w[1], w[2] = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
+    length, trace = math.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2), T[0, 0] + T[1, 1] + T[2, 2]
+    angle = math.atan2(length, trace - 1)
+    if length < TINY and trace < 0:  # half a turn, about an axis that is not known
+        w[2] = length = 1.0
+    w *= angle / length if length > TINY else 0.5
+    half, square = angle / 2, angle**2
     second, fourth = 1 / 12 + square / 720, -1 / 720
-    if square > SERIES**2:
-        half = math.sqrt(square) / 2
+    if angle > SERIES:
         even = half / math.tan(half)
         second = (1 - even) / square
         fourth = (1 - even / 2 - (half / math.sin(half)) ** 2 / 2) / square**2
     for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        derivative[a, a] = 1 + second * (w[a] ** 2 - square)
+        derivative[a, b] = second * w[a] * w[b] - w[c] / 2
+        derivative[b, a] = second * w[a] * w[b] + w[c] / 2
+    for a in range(3):
+        v[a] = 0.0
         for b in range(3):
-            one = w[a] * w[b] - square * (a == b)
-            mixed = v[a] * w[b] + w[a] * v[b] - 2 * both * (a == b)
-            derivative[a, b] = second * one + (a == b)
-            derivative[a + 3, b] = second * mixed - 2 * fourth * both * one
+            v[a] += derivative[b, a] * T[b, 3]
+    both = v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
-        for row, half_turn in ((0, w[c] / 2), (3, v[c] / 2)):
-            derivative[row + b, a] += half_turn
-            derivative[row + a, b] -= half_turn
+        mixed = second * (v[a] * w[b] + w[a] * v[b]) - 2 * fourth * both * w[a] * w[b]
+        derivative[a + 3, a] = -2 * fourth * both * (w[a] ** 2 - square)
+        derivative[a + 3, a] += 2 * second * (v[a] * w[a] - both)
+        derivative[a + 3, b], derivative[b + 3, a] = mixed - v[c] / 2, mixed + v[c] / 2
     derivative[3:, 3:] = derivative[:3, :3]
 
 
@@ -130,7 +121,7 @@ def _linearize(poses, ends, motions, information, at, errors, jacobians, local, 
         i, j = ends[f]
         _between(origin if i < 0 else poses[i], poses[j], step)
         _between(motions[f], step, off)
-        _logarithm(off, twist)
+        _logarithm(off, twist, derivative)
         x, y, z = step[0, 3], step[1, 3], step[2, 3]
         for a in range(3):
             u, v, w = step[0, a], step[1, a], step[2, a]
@@ -140,7 +131,6 @@ def _linearize(poses, ends, motions, information, at, errors, jacobians, local, 
             adjoint[a + 3, 0] = v * z - w * y
             adjoint[a + 3, 1] = w * x - u * z
             adjoint[a + 3, 2] = u * y - v * x
-        _derivative(twist, derivative)
         deviations[f] = 0.0
         for a in range(d):
             errors[f, a] = twist[at[a]]
