@@ -149,7 +149,10 @@ class PoseGraph:
 
     def _row(self, closure: Closure) -> tuple[Any, ...] | None:
         query = self.chain.find(closure.query_stamp, closure.query_robot)
-        place = self._place(closure)
+        place = self.chain.find(closure.place_stamp, closure.place_robot)
+        if closure.map_id and closure.place_pose is not None:
+            own = closure.map_id, closure.place_stamp, closure.place_pose
+            place = self.chain.fixed(*own), np.eye(4)
         if query is None or place is None or query[0] == place[0]:
             return None
         (i, to_query), (j, to_place) = query, place
@@ -160,13 +163,6 @@ class PoseGraph:
             i, j, to_place @ motion @ inverse(to_query),
             body_covariance(closure.covariance, motion), closure.is_independent,
         )  # fmt: skip
-
-    def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
-        if not closure.map_id:
-            return self.chain.find(closure.place_stamp, closure.place_robot)
-        assert closure.place_pose is not None
-        node = self.chain.fixed(closure.map_id, closure.place_stamp, closure.place_pose)
-        return node, np.eye(4)
 
     def update(self, final: bool = False) -> np.ndarray:
         """
