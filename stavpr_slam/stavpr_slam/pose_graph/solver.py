@@ -359,9 +359,9 @@ class Pattern:
 @dataclass(eq=False)
 class Solver:
     """
-    Solves for poses by factors.
+    Solves for V poses by factors: the first V count always, others, closures, by their weights.
 
-    :param ends, motions: as in :func:`_linearize`, (m, 2) and (m, 4, 4).
+    :param ends, motions: as in :func:`_linearize`, (V + n, 2) and (V + n, 4, 4).
     :param at: as in :func:`_linearize`.
     """
 
@@ -371,7 +371,7 @@ class Solver:
     _patterns: list[Pattern] = field(default_factory=list)
 
     def linearize(self, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-        """Return the squared deviations of all factors, (m,), and keep their derivatives."""
+        """Return the squared deviations of all factors, (V + n,), and keep their derivatives."""
         count, d = len(self.ends), len(self.at)
         self._errors, self._local = np.empty((count, d)), np.empty((count, d, d))
         self._jacobians = np.empty((count, d, d))
@@ -386,11 +386,11 @@ class Solver:
         """
         Return the poses after a step from those that were linearized at last.
 
-        :param weights: of the factors, (m,).
+        :param weights: of the closures, (n,).
         :returns: and the logarithm of the determinant of the square root of the information.
         :raises LinAlgError: the poses have no unique solution.
         """
-        pattern, blocks, x, determinant = self._decomposed(weights, len(poses))
+        pattern, blocks, x, determinant = self._decomposed(weights)
         result = np.empty_like(poses)
         if math.isfinite(determinant):
             _solve(pattern.starts, pattern.rows, blocks, x)
@@ -399,39 +399,39 @@ class Solver:
             raise np.linalg.LinAlgError('the pose graph has no unique solution')
         return result, determinant
 
-    def _decomposed(
-        self, weights: np.ndarray, count: int
-    ) -> tuple[Pattern, np.ndarray, np.ndarray, float]:
+    def _decomposed(self, weights: np.ndarray) -> tuple[Pattern, np.ndarray, np.ndarray, float]:
         """Return the pattern, the blocks of the root, the right side, and its determinant."""
-        pattern = self._pattern(weights > 0, count)
+        count = len(self.ends) - len(weights)
+        whole = np.concatenate([np.ones(count), weights])
+        pattern = self._pattern(whole > 0, count)
         return pattern, *_assemble(
             pattern.columns, pattern.both, pattern.starts, pattern.rows, self._errors,
-            self._jacobians, self._local, weights,
+            self._jacobians, self._local, whole,
         )  # fmt: skip
 
     def innovations(
-        self, count: int, weights: np.ndarray, chosen: np.ndarray, spread: np.ndarray | None = None
+        self, weights: np.ndarray, chosen: np.ndarray, spread: np.ndarray | None = None
     ) -> np.ndarray:
         """
-        Return how factors differ from what the others expect, at the poses linearized at last.
+        Return how closures differ from what the others expect, at the poses linearized at last.
 
-        :param count: number of poses.
-        :param weights: of the factors, (m,).
-        :param chosen: n of them, which have a first pose.
-        :param spread: covariances of the motions between their ends, (n, d, d); None = as solved.
+        :param weights: of all closures in that solution, (n,).
+        :param chosen: numbers of some of them.
+        :param spread: covariances of the motions between their ends, as solved if None.
         :returns: in rows of 2 d + 1: errors on axes where they do not correlate, in deviations of
-            the factor, variances of what the others expect there, and the logarithm of the
-            determinant of the covariance of the factor.
+            the closure, variances of what the others expect there, and the logarithm of the
+            determinant of the covariance of the closure.
         """
+        counts, chosen = weights[chosen, None] > 0, chosen + len(self.ends) - len(weights)
         if spread is None:
-            pattern, blocks, *_ = self._decomposed(weights, count)
+            pattern, blocks, *_ = self._decomposed(weights)
             columns, jacobians = pattern.columns[chosen], self._jacobians[chosen]
             spread = np.zeros_like(jacobians)
             _covariances(pattern.starts, pattern.rows, blocks, columns, jacobians, spread)
         root = np.linalg.cholesky(self._local[chosen])
         variances, axes = np.linalg.eigh(root.mT @ spread @ root)
-        variances, counts = variances.clip(0), weights[chosen, None] > 0
-        # factors that count have made errors and variances smaller
+        variances = variances.clip(0)
+        # closures that count have made errors and variances smaller
         rest = np.where(counts, (1 - variances).clip(ALONE), 1.0)
         errors = (axes.mT @ (root.mT @ self._errors[chosen, :, None]))[:, :, 0]
         size = -2 * np.log(np.einsum('nii->ni', root)).sum(axis=1)
@@ -449,9 +449,8 @@ class Solver:
 
 def compile_kernels() -> None:
     """Compile all kernels, by a step of two poses, for ``stavpr warm``."""
-    ends, count = np.array([[-1, 0], [0, 1]]), 2
-    poses, weights = np.tile(np.eye(4), (count, 1, 1)), np.ones(count)
-    solver = Solver(ends, poses.copy(), np.arange(6))
-    solver.linearize(poses, np.tile(np.eye(6), (count, 1, 1)))
-    solver.step(poses, weights)
-    solver.innovations(count, weights, np.array([1]))
+    same, weights = np.tile(np.eye(4), (3, 1, 1)), np.ones(1)
+    solver = Solver(np.array([[-1, 0], [0, 1], [0, 1]]), same, np.arange(6))
+    solver.linearize(same[:2], np.tile(np.eye(6), (3, 1, 1)))
+    solver.step(same[:2], weights)
+    solver.innovations(weights, np.array([0]))
