@@ -122,15 +122,11 @@ def _linearize(poses, ends, motions, information, at, errors, jacobians, local, 
         _between(origin if i < 0 else poses[i], poses[j], step)
         _between(motions[f], step, off)
         _logarithm(off, twist, derivative)
-        x, y, z = step[0, 3], step[1, 3], step[2, 3]
-        for a in range(3):
-            u, v, w = step[0, a], step[1, a], step[2, a]
-            adjoint[a, 0] = adjoint[a + 3, 3] = -u
-            adjoint[a, 1] = adjoint[a + 3, 4] = -v
-            adjoint[a, 2] = adjoint[a + 3, 5] = -w
-            adjoint[a + 3, 0] = v * z - w * y
-            adjoint[a + 3, 1] = w * x - u * z
-            adjoint[a + 3, 2] = u * y - v * x
+        for b in range(3):
+            c, e = (b + 1) % 3, (b + 2) % 3
+            for a in range(3):
+                adjoint[a, b] = adjoint[a + 3, b + 3] = -step[b, a]
+                adjoint[a + 3, b] = step[c, a] * step[e, 3] - step[e, a] * step[c, 3]
         deviations[f] = 0.0
         for a in range(d):
             errors[f, a] = twist[at[a]]
