@@ -207,7 +207,7 @@ class PoseGraph:
                 break
             solution = better
         # where none is accepted without breaks, a few false runs agree with them
-        if not without.accepted.any() and solution.accepted.sum() <= solution.rejected:
+        if not without.accepted.any() and 2 * solution.accepted.sum() <= len(solution.accepted):
             for node in [*self.chain.splits][::-1]:
                 self._split(node, False)
             solution = without
@@ -282,7 +282,7 @@ class PoseGraph:
     @property
     def rejected(self) -> int:
         """Return the number of rejected closures."""
-        return self._solution.rejected
+        return len(self._solution.accepted) - self.accepted
 
     @property
     def used(self) -> ClosureArrays:
