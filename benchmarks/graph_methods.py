@@ -51,7 +51,7 @@ FALSE = {  # share, in runs, images of a run
 }  # fmt: skip
 TRIED = {  # of each kind of drive
     'large drift': list(FALSE), 'small drift': ['', '50 % in runs'],
-    'sessions': ['', '30 % in runs'], 'carried': [each for each in FALSE if 'alone' not in each],
+    'sessions': ['', '30 % in runs'], 'carried': [name for name in FALSE if 'alone' not in name],
 }  # fmt: skip
 SIGMAS = OdometryNoise()
 MEASURED = np.diag([0.3] * 3 + [0.02] * 3) ** 2  # of the closures on a circle
@@ -92,8 +92,8 @@ def kitti(name: str, alpha: str) -> Drive:
     """Return a drive of the folder kitti_graphs of STAVPR_DATA."""
     folder = Path(os.environ['STAVPR_DATA']) / 'kitti_graphs' / name
     odometry, truth = (
-        np.loadtxt(folder / f'{each}.csv', delimiter=',', skiprows=1)
-        for each in ('odometry', 'truth')
+        np.loadtxt(folder / f'{file}.csv', delimiter=',', skiprows=1)
+        for file in ('odometry', 'truth')
     )
     pairs = np.loadtxt(folder / f'closures_alpha_{alpha}.csv', int, delimiter=',', skiprows=1)
     stamps = (np.arange(len(odometry), dtype=np.int64) + 10) * 10**8
@@ -112,9 +112,9 @@ def backwards(drive: Drive) -> Drive:
     T = matrices(drive.odometry)[::-1]
     mirrored = dict(zip(drive.stamps.tolist(), drive.stamps[::-1].tolist(), strict=True))
     closures = [
-        replace(each, query_stamp=mirrored[each.place_stamp],
-                place_stamp=mirrored[each.query_stamp])
-        for each in drive.closures
+        replace(closure, query_stamp=mirrored[closure.place_stamp],
+                place_stamp=mirrored[closure.query_stamp])
+        for closure in drive.closures
     ]  # fmt: skip
     odometry = to_poses(inverse(T[:1]) @ T)
     name = f'{drive.name} backwards'
@@ -151,11 +151,11 @@ def worlds(seed: int, draw: int, folder: Path) -> Iterator[Drive]:
                 places = false_places.FalsePlaces(share, coherent, 100 * seed + draw)
                 used: set[int] = set()
                 closures, ends = [], []
-                for each in (each for each in pairs if each.closure is not None):
-                    used |= {each.query, each.place}
-                    place = places.place(each.place, used)
-                    closures.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
-                    ends.append((each.query, place, each.place))
+                for match in (match for match in pairs if match.closure is not None):
+                    used |= {match.query, match.place}
+                    place = places.place(match.place, used)
+                    closures.append(replace(match.closure, place_stamp=int(drive.stamps[place])))
+                    ends.append((match.query, place, match.place))
             query, place, measured = np.array(ends).T
             away = np.linalg.norm(drive.truth[query, :2] - drive.truth[place, :2], axis=1)
             right = (away < RIGHT['world']) & (np.abs(place - measured) < 3)
@@ -215,13 +215,13 @@ def driven(drive: Drive, group: int) -> dict[str, Any]:
     the processor time of an update, median and 90 %.
     """
     graph, at, above, times = PoseGraph(), 0, 0.0, []
-    closures = sorted(drive.closures, key=lambda each: each.query_stamp)
+    closures = sorted(drive.closures, key=lambda closure: closure.query_stamp)
     for number, first in enumerate(range(0, len(closures), group)):
-        for each in closures[first : first + group]:
-            while at < len(drive.stamps) and drive.stamps[at] <= each.query_stamp:
+        for closure in closures[first : first + group]:
+            while at < len(drive.stamps) and drive.stamps[at] <= closure.query_stamp:
                 graph.add_odometry(int(drive.stamps[at]), drive.odometry[at])
                 at += 1
-            graph.add_closure(each)
+            graph.add_closure(closure)
         began = time.process_time()
         graph.update()
         times.append((time.process_time() - began) * 1e3)
@@ -243,8 +243,8 @@ def _errors(drive: Drive, graph: PoseGraph) -> list[float]:
     stamps = graph.chain.stamps
     truth = planar_poses(drive.truth[np.searchsorted(drive.stamps, stamps)])
     return [
-        float(trajectory_errors(stamps, to_poses(each), truth)[0])
-        for each in (graph.solved, graph.chain.transforms)
+        float(trajectory_errors(stamps, to_poses(nodes), truth)[0])
+        for nodes in (graph.solved, graph.chain.transforms)
     ]
 
 
@@ -253,7 +253,7 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
     T, index = matrices(drive.odometry), {int(t): i for i, t in enumerate(drive.stamps)}
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     tight = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, 1e-4))
-    poses = [gtsam.Pose3(each) for each in T]
+    poses = [gtsam.Pose3(pose) for pose in T]
     graph.add(gtsam.PriorFactorPose3(0, poses[0], tight))
     for i, pose in enumerate(poses):
         values.insert(i, pose)
@@ -263,12 +263,12 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
         model = gtsam.noiseModel.Diagonal.Sigmas(deviations * np.sqrt(length))
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, a.between(b), model))
     indices = list(range(graph.size()))
-    for each in drive.closures:
-        Z = matrices(each.pose)
-        model = gtsam.noiseModel.Gaussian.Covariance(body_covariance(each.covariance, Z))
+    for closure in drive.closures:
+        Z = matrices(closure.pose)
+        model = gtsam.noiseModel.Gaussian.Covariance(body_covariance(closure.covariance, Z))
         if kernel is not None:
             model = gtsam.noiseModel.Robust.Create(kernel, model)
-        ends = index[each.place_stamp], index[each.query_stamp]
+        ends = index[closure.place_stamp], index[closure.query_stamp]
         graph.add(gtsam.BetweenFactorPose3(*ends, gtsam.Pose3(Z), model))
     if gnc:
         options = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
@@ -326,19 +326,19 @@ def reference(drive: Drive) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]], right: list[dict[str, Any]]) -> list[str]:
     """Return the worst ratio of each method and kind of drive as lines of Markdown."""
     floor = {}
-    for each in right:
-        best = [each['this graph']] + [each['least squares']] * (each['kind'] == 'KITTI')
-        floor[each['kind'], each['drive']] = min(best)
-    kinds = list(dict.fromkeys(each['kind'] for each in rows))
+    for row in right:
+        best = [row['this graph']] + [row['least squares']] * (row['kind'] == 'KITTI')
+        floor[row['kind'], row['drive']] = min(best)
+    kinds = list(dict.fromkeys(row['kind'] for row in rows))
     lines = ['| | ' + ' | '.join(kinds) + ' | seconds |', '|---|' + '---|' * (len(kinds) + 1)]
-    for method in dict.fromkeys(each['method'] for each in rows):
-        own = [each for each in rows if each['method'] == method]
+    for method in dict.fromkeys(row['method'] for row in rows):
+        own = [row for row in rows if row['method'] == method]
         ratios = [
             [e['error'] / floor[e['kind'], e['drive']] for e in own if e['kind'] == kind]
             for kind in kinds
         ]
-        seconds = sum(each['seconds'] for each in own)
-        cells = ' | '.join(f'{max(each):.2f}' if each else '' for each in ratios)
+        seconds = sum(row['seconds'] for row in own)
+        cells = ' | '.join(f'{max(kind):.2f}' if kind else '' for kind in ratios)
         lines.append(f'| {method} | {cells} | {seconds:.0f} |')
     return lines
 

@@ -59,11 +59,11 @@ def render(seed: int, folder: Path) -> np.ndarray:
 def falsified(drive: LapDrive, pairs: list[Found], kind: str, seed: int) -> list[Closure]:
     """Return the closures with a share of wrong places."""
     false, used, result = FalsePlaces(*FALSE[kind], seed), set[int](), []
-    for each in pairs:
-        used |= {each.query, each.place}
-        place = false.place(each.place, used)
-        if each.closure is not None:
-            result.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
+    for match in pairs:
+        used |= {match.query, match.place}
+        place = false.place(match.place, used)
+        if match.closure is not None:
+            result.append(replace(match.closure, place_stamp=int(drive.stamps[place])))
     return result
 
 
@@ -103,30 +103,30 @@ def edge_errors(drive: LapDrive, pairs: list[Found]) -> dict[str, list[list[floa
     truly is (m).
     """
     rows: dict[str, list[list[float]]] = {'PNP': [], 'ALIGNED': []}
-    for each in pairs:
-        true = relative(drive.truth, each.query, each.place)
-        if not each.edge.has_pose:
+    for match in pairs:
+        true = relative(drive.truth, match.query, match.place)
+        if not match.edge.has_pose:
             continue
-        pose, i = each.edge.pose, [0, 1, 5]
+        pose, i = match.edge.pose, [0, 1, 5]
         yaw = Rotation.from_quat(pose[3:]).as_euler('ZYX')[0] - np.arctan2(true[1, 0], true[0, 0])
         off = np.array([*(pose[:2] - true[:2, 3]), (yaw + np.pi) % (2 * np.pi) - np.pi])
-        nees = off @ np.linalg.solve(each.edge.covariance[np.ix_(i, i)], off)
-        rows[each.edge.source.name].append([*off.tolist(), float(nees), float(true[1, 3])])
+        nees = off @ np.linalg.solve(match.edge.covariance[np.ix_(i, i)], off)
+        rows[match.edge.source.name].append([*off.tolist(), float(nees), float(true[1, 3])])
     return rows
 
 
 def biases(drive: LapDrive, pairs: list[Found]) -> dict[str, list[float]]:
     """Return along the track, on the same lane, what the edge and the place are off, in places."""
     rows: dict[str, list[float]] = {'edge': [], 'place_index': [], 'late': []}
-    for each in pairs:
-        laps = drive.images[[each.query, each.place], 0].tolist()
-        true = relative(drive.truth, each.query, each.place)
+    for match in pairs:
+        laps = drive.images[[match.query, match.place], 0].tolist()
+        true = relative(drive.truth, match.query, match.place)
         if laps != [2, 0] or np.hypot(*true[:2, 3]) > NEAR or abs(true[1, 3]) > 1:
             continue
-        spacing = each.pair.spacing
-        rows['late' if each.is_late else 'place_index'].append(float(-true[0, 3] / spacing))
-        if each.edge.has_pose:
-            rows['edge'].append(float((each.edge.pose[0] - true[0, 3]) / spacing))
+        spacing = match.pair.spacing
+        rows['late' if match.is_late else 'place_index'].append(float(-true[0, 3] / spacing))
+        if match.edge.has_pose:
+            rows['edge'].append(float((match.edge.pose[0] - true[0, 3]) / spacing))
     return rows
 
 
@@ -150,7 +150,7 @@ def measure_drift(drive: LapDrive, pairs: list[Found], seed: int) -> dict[str, A
     poses, graph = optimize(drive.stamps, odometry, measured(pairs))
     before = ate(drive, odometry)
     right = [
-        np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR for each in pairs
+        np.hypot(*relative(drive.truth, match.query, match.place)[:2, 3]) < NEAR for match in pairs
     ]
     row = {
         'before': before,
@@ -164,7 +164,7 @@ def measure_drift(drive: LapDrive, pairs: list[Found], seed: int) -> dict[str, A
         'edges': edge_errors(drive, pairs),
         'biases': biases(drive, pairs),
         'pnp': sum(
-            each.edge.source is Source.PNP for each, ok in zip(pairs, right, strict=True) if ok
+            match.edge.source is Source.PNP for match, ok in zip(pairs, right, strict=True) if ok
         ),
     }
     for kind in FALSE:
@@ -189,10 +189,10 @@ def measure_carried(drive: LapDrive, pairs: list[Found]) -> dict[str, Any]:
     odometry = planar_poses(drive.odometry)
     poses, final = optimize(drive.stamps, odometry, measured(pairs))
     behind = [
-        each.known
-        for each in pairs
-        if each.query >= CARRIED.start
-        and np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR
+        match.known
+        for match in pairs
+        if match.query >= CARRIED.start
+        and np.hypot(*relative(drive.truth, match.query, match.place)[:2, 3]) < NEAR
     ]
     graph, waiting, first, errors = PoseGraph(), list(pairs), min(behind), []
     for i in range(first + ONLINE + 1):
@@ -230,7 +230,7 @@ def measure(seed: int, draw: int, folder: Path) -> Iterator[tuple[str, dict[str,
         closures = found(drive, name, draw == 0)
         row = measure_drift(drive, closures, 100 * seed + draw)
         if draw == 0:
-            row['pnp_ms'] = [each.seconds * 1e3 for each in closures]
+            row['pnp_ms'] = [closure.seconds * 1e3 for closure in closures]
             row['wrong'] = wrong_pairs(drive, closures, seed) if name == 'small' else []
         yield name, row
     if draw >= OTHER_DRAWS:

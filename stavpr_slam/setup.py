@@ -26,7 +26,7 @@ distribution = setup(
         (f'share/{NAME}', ['package.xml']),
         (
             f'lib/{NAME}',
-            [f'scripts/{each}' for each in ('bridge', 'optimize_graph', 'pose_graph')],
+            [f'scripts/{name}' for name in ('bridge', 'optimize_graph', 'pose_graph')],
         ),
     ],
     python_requires='>=3.11',

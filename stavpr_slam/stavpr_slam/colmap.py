@@ -17,7 +17,7 @@ from stavpr_ros.sources import open_source
 
 NEIGHBORS = 5  # places before a place that it is paired with
 BESIDE = 1  # places beside a recognized place that its query is paired with as well
-QUALITY = 95  # of JPEG
+JPEG = cv2.IMWRITE_JPEG_QUALITY, 95
 ALL = 1000.0  # images per second of a video: all of them
 
 
@@ -50,9 +50,7 @@ def export(
         for place, image in _images(place_map, images, topic, camera):
             height, width = image.shape[:2]
             sizes[place] = width, height
-            encoded = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[
-                1
-            ]
+            _, encoded = cv2.imencode('.jpg', image[..., ::-1], JPEG)
             (new / 'images' / _name(place)).write_bytes(encoded.tobytes())
         if not sizes:
             raise InputError(

@@ -93,7 +93,7 @@ class Target(Node):
             self.received |= int(counts.get('closures', 0)) > 0
 
     def _add_link(self, request, response):
-        """Note an edge: the pose is that of the second node in the frame of the first one."""
+        """Note an edge: the pose of the second node in the frame of the first one."""
         link = request.link
         t, o = link.transform.translation, link.transform.rotation
         covariance = np.linalg.inv(np.array(link.information).reshape(6, 6))

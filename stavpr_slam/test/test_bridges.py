@@ -3,6 +3,7 @@
 """The bridges to other SLAM systems: moved edges, poses, and each bridge as a process."""
 
 from collections import Counter
+from functools import partial
 import json
 import os
 from pathlib import Path
@@ -24,9 +25,10 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_slam.commands.bridge import main
-from stavpr_slam.pose_graph import Closure
+from stavpr_slam.pose_graph import ChainSettings, Closure, OdometryNoise
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
-from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
+from stavpr_slam.ros.bridges.external_keyframes import keyframe_edge, nearest
 from stavpr_slam.ros.bridges.poses import RobotLocalizationBridge
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
@@ -64,23 +66,25 @@ def test_keyframe_edge_covariance_is_that_of_samples():
     np.testing.assert_allclose(np.cov(errors.T), covariance, atol=2e-3)
 
 
-def test_external_keyframes_near_returns_nearest_with_motion():
-    keyframes = ExternalKeyframes(max_gap=2.0)
+def test_nearest_external_keyframe_is_returned_with_its_motion():
+    keyframes, odometry = dict[int, int](), KeyframeChain(ChainSettings(), OdometryNoise())
     at = lambda x: np.array([x, 0, 0, 0, 0, 0, 1.0])  # noqa: E731
-    keyframes.odometry.add(SECOND, at(1.0))
-    keyframes.add(3 * SECOND // 2, 5)  # before the odometry after it
-    assert keyframes.near(2 * SECOND) is None
+    near = partial(nearest, keyframes, odometry, 2 * SECOND)
+    assert near(SECOND) is None
+    odometry.add(SECOND, at(1.0))
+    keyframes[3 * SECOND // 2] = 5  # before the odometry after it
+    assert near(2 * SECOND) is None
     for second in (2, 3, 4, 5, 6, 7):
-        keyframes.odometry.add(second * SECOND, at(second))
-    keyframes.add(4 * SECOND, 6)
-    number, motion = keyframes.near(2 * SECOND)
+        odometry.add(second * SECOND, at(second))
+    keyframes[4 * SECOND] = 6
+    number, motion = near(2 * SECOND)
     assert number == 5
     np.testing.assert_allclose(motion[:3, 3], [0.5, 0, 0])
-    assert keyframes.near(3 * SECOND)[0] == 6
-    assert keyframes.near(7 * SECOND) is None  # 3 s away
-    keyframes.add(9 * SECOND, 7)
-    assert keyframes.near(9 * SECOND)[0] == 7  # the same stamp: no motion
-    assert keyframes.near(17 * SECOND // 2) is None  # without odometry
+    assert near(3 * SECOND)[0] == 6
+    assert near(7 * SECOND) is None  # 3 s away
+    keyframes[9 * SECOND] = 7
+    assert near(9 * SECOND)[0] == 7  # the same stamp: no motion
+    assert near(17 * SECOND // 2) is None  # without odometry
 
 
 @pytest.mark.parametrize('target', [[], ['rtab'], ['--ros-args']])

@@ -10,6 +10,7 @@ from stavpr_ros.commands.stavpr import main
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import blocks, tuning
 from stavpr_slam.pose_graph.blocks import _Blocks as Blocks
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges, reversed_edge
@@ -193,6 +194,36 @@ def test_odometry_that_is_interrupted_begins_a_session(tmp_path, freedom, missin
     (tmp_path / 'a.g2o').write_text(''.join(line for line in lines if not line.startswith(tags)))
     assert main(['optimize_graph', str(tmp_path / 'a.g2o')]) == 0
     assert f'{1 + len(missing)} sessions: the odometry is inter' in capsys.readouterr().out
+
+
+def test_session_that_only_a_later_one_joins(tmp_path):
+    """Closures join the third lap to both others, which no closure joins."""
+    edges, lap, T = read_edges(write(tmp_path / 'a.g2o', 3)), 4 * SIDE, truth(3)
+    starts = lap - 1, 2 * lap - 1
+    odometry = [edge for edge in edges if edge[1] == edge[0] + 1 and edge[0] not in starts]
+    pairs = [(i, i % lap + 2 * lap) for i in range(0, 2 * lap, 2)]
+    closures = [(i, j, inverse(T[i]) @ T[j], edges[-1][3]) for i, j in pairs]
+    graph = graph_of([*odometry, *closures])
+    assert error(to_poses(graph.update(final=True)), to_poses(T)) < 0.3
+    assert (graph.chain.sessions, graph.rejected < 5) == (3, True)
+
+
+@pytest.mark.parametrize('live', [False, True])
+def test_graph_that_leaves_the_plane(live):
+    """The first 60 nodes are in a plane, and are solved before the others come, or not."""
+    T, information = truth(6), np.diag([400.0] * 3 + [3600.0] * 3)
+    T[:, 2, 3] = np.maximum(T[:, 2, 3] - T[60, 2, 3], 0)
+    ends = [(i, i + 1) for i in range(COUNT - 1)] + [(i, i + 48) for i in range(0, 96, 6)]
+    edges = [(i, j, inverse(T[i]) @ T[j], information) for i, j in ends]
+    graph = graph_of([edge for edge in edges if not live or edge[1] < 60])
+    if live:
+        graph.update()
+        for i in range(60, COUNT):
+            graph.add_odometry((i + 1) * SECOND, to_poses(T[i]))
+        for measurement in graph_of(edges)._pending[2:]:
+            graph.add_closure(measurement)
+    assert error(to_poses(graph.update()), to_poses(T)) < 0.01
+    assert (graph.accepted, graph.rejected) == (16, 0)
 
 
 def test_file_that_is_no_text_is_named(tmp_path):

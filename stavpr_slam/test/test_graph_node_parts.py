@@ -196,7 +196,7 @@ def test_server_of_robots_has_breaks_and_paths_of_each_in_no_trajectory_file(tmp
     snapshot = server.serve([*inputs, odometry('b', 9)], True, None)
     assert snapshot.breaks == [('b', 'no odometry for 8.0 s')]
     assert {'b no odometry for 8.0 s'} == {snapshot.values['breaks']}
-    stamps = {robot: rows[0].tolist() for robot, rows in snapshot.paths.trajectories.items()}
+    stamps = {robot: rows[0].tolist() for robot, rows in snapshot.trajectories.items()}
     saved = server.serve([], False, (f'{tmp_path}/drive.tum', False)).saved
     assert 'ends in .g2o, the file of several robots' in saved
     assert stamps == {'a': [SECOND, 2 * SECOND], 'b': [SECOND, 2 * SECOND, 10 * SECOND]}
@@ -214,7 +214,7 @@ def test_live_graph_ends_as_the_recorded_drive():
             inputs.append(waiting.pop(0))
         server.serve(inputs, False, None)
     snapshot = server.serve(waiting, True, None)
-    _, _, live = snapshot.paths.trajectories['']
+    _, _, live = snapshot.trajectories['']
     offline, _ = optimize((np.arange(len(truth)) + 1) * SECOND, poses, closures)
     expected = error(offline, truth)
     assert expected < 0.15 * error(poses, truth)

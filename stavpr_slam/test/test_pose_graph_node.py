@@ -325,7 +325,7 @@ def test_pose_graph_of_robots_has_topics_of_each(peer, graph):
 
 
 def test_pose_graph_of_two_robots_is_in_one_frame(peer, graph):
-    """Robot b drives the lap after that of robot a; its odometry begins elsewhere."""
+    """Robot b drives the lap after robot a; its odometry begins elsewhere."""
     graph('robots:=[a, b]')
     odometry, corrected, paths, publishers = {}, {'a': [], 'b': []}, {'a': [], 'b': []}, {}
     truth, latched = circle(), QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -39,7 +39,7 @@ def chain():
 
 
 def step_covariance(step: np.ndarray, noise: OdometryNoise) -> np.ndarray:
-    """Return that of errors in the middle of a step, in the axes of its end, rotation first."""
+    """Return the covariance of errors in the middle of a step, in the axes of its end."""
     length = np.linalg.norm(step[:3, 3])
     middle = np.eye(4)
     middle[:3, 3] = -(step[:3, :3].T @ step[:3, 3]) / 2

@@ -8,7 +8,7 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
-from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
+from stavpr_slam.pose_graph.graph import GraphSettings, optimize
 from stavpr_slam.pose_graph.keyframes import ChainSettings
 
 # Deviations of a closure by appearance alone: the query is taken to be where the place is.
@@ -31,15 +31,13 @@ def align_maps(reference: np.ndarray, poses: np.ndarray, pairs: np.ndarray) -> n
     :raises InputError: too few pairs agree.
     """
     keyframes = ChainSettings(distance=0.0, max_gap=math.inf, max_speed=math.inf)
-    graph = PoseGraph(GraphSettings(keyframes))
-    for i, pose in enumerate(poses):
-        graph.add_odometry((i + 1) * SECOND, pose)
-    for query, place in pairs.tolist():
-        graph.add_closure(
-            Closure((query + 1) * SECOND, place + 1, IDENTITY, APPEARANCE, False, 'reference',
-                    reference[place])
-        )  # fmt: skip
-    graph.update()
+    closures = [
+        Closure((query + 1) * SECOND, place + 1, IDENTITY, APPEARANCE, False, 'reference',
+                reference[place])
+        for query, place in pairs.tolist()
+    ]  # fmt: skip
+    stamps = np.arange(1, len(poses) + 1) * SECOND
+    _, graph = optimize(stamps, poses, closures, GraphSettings(keyframes))
     chosen = [(edge.query, edge.place) for edge in graph.edges if edge.accepted]
     if not len(graph.used):
         raise InputError(

@@ -18,7 +18,7 @@ from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.sessions import extend, Pair, place, Placement, weak_pairs
-from stavpr_slam.pose_graph.solution import Solution
+from stavpr_slam.pose_graph.solution import NOTHING, Solution
 from stavpr_slam.pose_graph.solver import likelihoods, scale_errors, squares
 
 PASSES = False, True  # over the closures of a block: again for those that agree by now
@@ -60,7 +60,7 @@ class Beliefs:
         Return these with the best factor on all errors, in parts of the last one.
 
         :param rows: innovations of closures.
-        :param runs: numbers of their runs of nodes; those of a run count as one.
+        :param runs: numbers of their runs of nodes; all closures of a run count as one.
         """
         weights = weights_in_runs(runs)
         factors = np.array([1.0, *factors])
@@ -89,13 +89,13 @@ class MeasuredSolution(Solution):
 
 
 def weights_in_runs(runs: np.ndarray) -> np.ndarray:
-    """Return weights of closures by which those of a run of nodes count as one, (n,)."""
+    """Return weights by which all closures of a run of nodes count as one, (n,)."""
     numbers = np.unique(runs, return_inverse=True)[1]
     return np.asarray(1 / np.bincount(numbers)[numbers])
 
 
 def are_certain(odds: np.ndarray, runs: np.ndarray) -> bool:
-    """Return whether closures are certain together, those of a run as one, by their odds."""
+    """Return whether closures are certain together, where a run counts as one, by their odds."""
     return bool(weights_in_runs(runs) @ odds > tuning.CERTAIN)
 
 
@@ -125,14 +125,16 @@ class _Blocks:
         self._chain, self._closures, self._placement = chain, closures, placement
         self._latest = np.maximum(closures.query, closures.place)
         self._runs = self._latest // tuning.LONGEST  # whose closures may be wrong together
+        self._network = network = Network(chain, placement.initial, closures, placement.links)
+        width = 2 * network.freedom + 1
+        if isinstance(last, MeasuredSolution) and last.beliefs.innovations.shape[1] == width:
+            beliefs = last.beliefs
+        else:  # nothing, or in a plane that the odometry has left
+            last, beliefs = NOTHING, Beliefs(network.room, np.zeros((0, width)))
         count, old, self._nodes = len(closures), len(last.accepted), last.nodes
         self._is_old = np.arange(count) < old
         self._accepted = np.zeros(count, bool)
         self._accepted[:old] = last.accepted & placement.allowed[:old]
-        self._network = network = Network(chain, placement.initial, closures, placement.links)
-        beliefs = Beliefs(network.room, np.zeros((0, 2 * network.freedom + 1)))
-        if isinstance(last, MeasuredSolution):
-            beliefs = last.beliefs
         self._beliefs = beliefs.resize(network.room, count)
         self._searches = count > 0 and count >= tuning.SEARCH * beliefs.search_count
         if self._searches:
@@ -172,11 +174,17 @@ class _Blocks:
         Decide on the closures of a block.
 
         :param own: numbers of all closures up to its end.
-        :param new: those of them that are new, bool.
+        :param new: which of them are new, bool.
         :param swaps: leave out weak ones on trial.
         """
         self._own = own
-        self._network = Network(part, self._nodes, self._closures[own], self._placement.links)
+        links = {  # a session may be tied to a later one
+            node: link if link < len(part) else part.before(node)
+            for node, link in self._placement.links.items()
+            if node < len(part)
+        }
+        freedom = self._network.freedom
+        self._network = Network(part, self._nodes, self._closures[own], links, freedom)
         network, limit = self._network, self._network.limit * tuning.TAILS
         network.limit, network.room = limit, self._beliefs.space
         values, accepted = network.values(self._nodes), self._accepted[own]

@@ -22,7 +22,7 @@ class Closure:
     :param query_stamp, place_stamp: ns.
     :param pose: of the query in the place's frame, shape (7,).
     :param covariance: x y z, rotations about the fixed axes of the place, shape (6, 6).
-    :param is_independent: its error does not correlate with that of the edge before.
+    :param is_independent: its error does not correlate with the edge before.
     :param map_id: of the map that the place is in, whose pose there is ``place_pose``, shape (7,);
         empty = the place is on the same drive.
     :param query_robot, place_robot: whose odometry the stamps are of.
@@ -59,7 +59,7 @@ class Closure:
         if not np.array_equal(limited, values):
             covariance = (axes * limited) @ axes.T
         if self.query_stamp <= 0 or self.place_stamp <= 0:
-            raise InputError('a closure has a stamp of 0: expected those of the two images')
+            raise InputError('a closure has a stamp of 0: expected the stamps of the two images')
         if self.map_id and self.place_pose is None:
             raise InputError('a closure with a map has no pose of the place in the map')
         place = None if self.place_pose is None else normalize_pose(self.place_pose)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of a pose graph: g2o, and trajectories in the formats of TUM and KITTI."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -54,19 +53,15 @@ def save_graph(graph: PoseGraph, path: str, force: Force = False) -> int:
     :raises SettingsError: another suffix.
     :raises OutputError: it cannot be written, or exists.
     """
-    suffix = Path(path).suffix
-    kinds: dict[str, tuple[FileKind, Callable[[], str]]] = {
-        '.g2o': (G2O, lambda: g2o_text(graph)),
-        '.tum': (TUM, lambda: tum_text(*_trajectory(graph))),
-        '.kitti': (KITTI, lambda: kitti_text(_trajectory(graph)[1])),
-    }
-    if suffix not in kinds:
-        raise SettingsError(f'{path}: expected a name that ends in .kitti, .g2o or .tum')
-    kind, text = kinds[suffix]
-    write_output(path, text(), kind, force)
-    return len(graph.solved)
-
-
-def _trajectory(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
     stamps, _, corrected = graph.chain.trajectory(graph.solved)
-    return stamps, to_poses(corrected)
+    match Path(path).suffix:
+        case '.g2o':
+            kind, text = G2O, g2o_text(graph)
+        case '.tum':
+            kind, text = TUM, tum_text(stamps, to_poses(corrected))
+        case '.kitti':
+            kind, text = KITTI, kitti_text(to_poses(corrected))
+        case _:
+            raise SettingsError(f'{path}: expected a name that ends in .kitti, .g2o or .tum')
+    write_output(path, text, kind, force)
+    return len(graph.solved)

@@ -19,11 +19,10 @@ from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings
-from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
+from stavpr_slam.pose_graph.transforms import adjoints, planar_poses, TRANSLATION_FIRST
 
 HALF = np.diag([1.0, 1, 1, 2, 2, 2])
 OUT_OF_PLANE = 1e4  # information of z, roll and pitch that a plane's edges are given
-ORDER = [3, 4, 5, 0, 1, 2]  # rotation first, or translation
 SIZES = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}  # numbers of a pose, of its information
 NORM_ERROR = 0.1  # of a quaternion in text, of a few digits
 ROUNDING = 1e-12  # of an eigenvalue, in parts of the greatest
@@ -54,7 +53,7 @@ def g2o_text(graph: PoseGraph) -> str:
 
 
 def _edge_text(start: int, end: int, transform: np.ndarray, covariance: np.ndarray) -> str:
-    information = np.linalg.inv(covariance)[np.ix_(ORDER, ORDER)]
+    information = np.linalg.inv(covariance)[TRANSLATION_FIRST]
     upper = (HALF @ information @ HALF)[np.triu_indices(6)]
     return f'EDGE_SE3:QUAT {start} {end} {_numbers(to_poses(transform))} {_numbers(upper)}'
 
@@ -145,7 +144,7 @@ def _edge(tag: str, fields: list[str], counts: Counter[str]) -> Edge:
 
 def reversed_edge(start: int, end: int, motion: np.ndarray, information: np.ndarray) -> Edge:
     """Return the same edge from its end to its start."""
-    turn = adjoints(inverse(motion)[None])[0][np.ix_(ORDER, ORDER)]
+    turn = adjoints(inverse(motion)[None])[0][TRANSLATION_FIRST]
     return end, start, inverse(motion), turn.T @ information @ turn
 
 
@@ -184,7 +183,7 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
         elif i:
             motion, stated = odometry[i - 1][2:]
             stamp, pose = stamp + SECOND, pose @ motion
-            turn, errors = adjoints(pose[None])[0], np.linalg.inv(stated)[np.ix_(ORDER, ORDER)]
+            turn, errors = adjoints(pose[None])[0], np.linalg.inv(stated)[TRANSLATION_FIRST]
             spread = spread + turn @ errors @ turn.T
         stamps.append(stamp)
         graph.add_odometry(stamp, to_poses(pose))

@@ -149,7 +149,10 @@ class PoseGraph:
 
     def _row(self, closure: Closure) -> tuple[Any, ...] | None:
         query = self.chain.find(closure.query_stamp, closure.query_robot)
-        place = self._place(closure)
+        place = self.chain.find(closure.place_stamp, closure.place_robot)
+        if closure.map_id and closure.place_pose is not None:
+            own = closure.map_id, closure.place_stamp, closure.place_pose
+            place = self.chain.fixed(*own), np.eye(4)
         if query is None or place is None or query[0] == place[0]:
             return None
         (i, to_query), (j, to_place) = query, place
@@ -160,13 +163,6 @@ class PoseGraph:
             i, j, to_place @ motion @ inverse(to_query),
             body_covariance(closure.covariance, motion), closure.is_independent,
         )  # fmt: skip
-
-    def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
-        if not closure.map_id:
-            return self.chain.find(closure.place_stamp, closure.place_robot)
-        assert closure.place_pose is not None
-        node = self.chain.fixed(closure.map_id, closure.place_stamp, closure.place_pose)
-        return node, np.eye(4)
 
     def update(self, final: bool = False) -> np.ndarray:
         """
@@ -202,7 +198,7 @@ class PoseGraph:
         follows = not final and len(self._sources) <= tuning.SEARCH * self._searched
         if isinstance(last, DriveSolution) and follows:
             return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
-        for node in self.chain.splits[::-1]:
+        for node in [*self.chain.splits][::-1]:
             self._split(node, False)
         solution = without = decide_anew(*graph)
         for _ in range(tuning.MAX_BREAKS):
@@ -211,8 +207,8 @@ class PoseGraph:
                 break
             solution = better
         # where none is accepted without breaks, a few false runs agree with them
-        if not without.accepted.any() and solution.accepted.sum() <= solution.rejected:
-            for node in self.chain.splits[::-1]:
+        if not without.accepted.any() and 2 * solution.accepted.sum() <= len(solution.accepted):
+            for node in [*self.chain.splits][::-1]:
                 self._split(node, False)
             solution = without
         self._searched = len(self._sources)
@@ -286,7 +282,7 @@ class PoseGraph:
     @property
     def rejected(self) -> int:
         """Return the number of rejected closures."""
-        return self._solution.rejected
+        return len(self._solution.accepted) - self.accepted
 
     @property
     def used(self) -> ClosureArrays:

@@ -4,7 +4,7 @@
 
 from bisect import bisect_right
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -33,24 +33,6 @@ class ChainSettings:
     max_speed: float = 60.0
 
 
-@dataclass(eq=False)
-class OdometryRecording:
-    """
-    Odometry without a break, of one robot.
-
-    :param nodes, begins: its keyframes, and the stamps from which odometry moves with each, ns.
-    :param tail: stamp and pose of the newest odometry.
-    :param spread: covariance of the odometry at the last keyframe as in its message, (6, 6).
-    """
-
-    robot: str
-    track: OdometryTrack
-    tail: tuple[int, np.ndarray]
-    spread: np.ndarray | None
-    nodes: list[int] = field(default_factory=list)
-    begins: list[int] = field(default_factory=list)
-
-
 class KeyframeChain:
     """
     Keyframes of the odometry in sessions, and fixed places of a map; all are nodes of the graph.
@@ -73,12 +55,12 @@ class KeyframeChain:
             ('robot', np.int32),
         ])  # fmt: skip
         self._count = 0
-        self._recordings: list[OdometryRecording] = []
-        self._current: dict[str, OdometryRecording] = {}  # of each robot
+        self._tracks: list[OdometryTrack] = []  # of each recording
+        self._current: dict[str, OdometryTrack] = {}  # of each robot
         self.robots: list[str] = []
         self.sessions = 0
         self._fixed: dict[tuple[str, int], int] = {}
-        self._cuts: dict[int, int] = {}  # first nodes after splits, and the nodes before
+        self.splits: dict[int, int] = {}  # first nodes behind them, and the nodes before
         self.breaks: list[tuple[str, str]] = []  # robot and reason
 
     def __len__(self) -> int:
@@ -115,53 +97,46 @@ class KeyframeChain:
         if stamp <= 0:
             raise InputError(f'odometry with stamp {stamp}: expected nanoseconds above 0')
         current = self._current.get(robot)
-        cause = self._break(current, stamp, pose)
+        cause, is_keyframe = self._break(current, stamp, pose), True
         if current is None or cause:
             if current is not None:
                 self.breaks.append((robot, cause))
-            track = OdometryTrack(self._settings.distance, self._settings.angle)
-            current = OdometryRecording(robot, track, (stamp, pose), covariance)
-            self._current[robot] = current
-            if robot not in self.robots:
+            else:
                 self.robots.append(robot)
-            self._recordings.append(current)
+            current = OdometryTrack(self._settings.distance, self._settings.angle, robot)
+            self._current[robot] = current
+            self._tracks.append(current)
             self.sessions += 1
-            track.add(stamp, pose, True)
-            self._append(current, stamp, pose, -1, covariance)
-            return True
-        if stamp <= current.tail[0]:
+        elif stamp <= current.newest[0]:
             return False
-        node = current.nodes[-1]
-        step = inverse(self.transforms[node]) @ matrices(pose)
-        near = np.linalg.norm(step[:3, 3]) < self._settings.distance
-        turns = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
-        is_keyframe = bool(turns or not near)
-        current.tail = stamp, pose
-        current.track.add(stamp, pose, is_keyframe)
+        else:
+            step = inverse(self.transforms[current.nodes[-1]]) @ matrices(pose)
+            near = np.linalg.norm(step[:3, 3]) < self._settings.distance
+            turns = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
+            is_keyframe = bool(turns or not near)
+        current.add(stamp, pose, is_keyframe)
         if is_keyframe:
-            self._append(current, stamp, pose, node, covariance)
+            self._append(current, covariance)
         return is_keyframe
 
-    def _break(self, current: OdometryRecording | None, stamp: int, pose: np.ndarray) -> str:
+    def _break(self, current: OdometryTrack | None, stamp: int, pose: np.ndarray) -> str:
         """Return why a new session begins; empty = none does."""
         if current is None:
             return 'start'
-        seconds = (stamp - current.tail[0]) / SECOND
+        seconds = (stamp - current.newest[0]) / SECOND
         if seconds < -0.5:
             return f'the stamps jumped back by {-seconds:.3f} s'
         if seconds > self._settings.max_gap:
             return f'no odometry for {seconds:.1f} s'
-        length = float(np.linalg.norm(pose[:3] - current.tail[1][:3]))
+        length = float(np.linalg.norm(pose[:3] - current.newest[1][:3]))
         if seconds >= 0 and length > max(2.0, self._settings.max_speed * seconds):
             return f'the odometry jumped by {length:.1f} m'
         return ''
 
-    def _append(
-        self, current: OdometryRecording, stamp: int, pose: np.ndarray, previous: int,
-        covariance: np.ndarray | None,
-    ) -> None:  # fmt: skip
-        transform = matrices(pose)
-        node = self._extend(stamp, transform, self.sessions - 1, len(self._recordings) - 1)
+    def _append(self, current: OdometryTrack, covariance: np.ndarray | None) -> None:
+        (stamp, pose), transform = current.newest, matrices(current.newest[1])
+        previous = current.nodes[-1] if current.nodes else -1
+        node = self._extend(stamp, transform, self.sessions - 1, len(self._tracks) - 1)
         row, before = self._nodes[node], self._nodes[previous]
         row['previous'], row['origin'] = previous, pose[:3]
         row['robot'] = self.robots.index(current.robot)
@@ -219,11 +194,10 @@ class KeyframeChain:
         After a split it is the keyframe after the stamp, where that is on the same side. None
         = no odometry at this stamp; the latest recording counts where stamps repeat.
         """
-        for recording in reversed(self._recordings):
-            first, last = recording.track.span
-            if recording.robot == robot and first <= stamp <= last:
-                node = recording.nodes[bisect_right(recording.begins, stamp) - 1]
-                return node, inverse(self.transforms[node]) @ matrices(recording.track.at(stamp))
+        for track in reversed(self._tracks):
+            if track.robot == robot and track.has(stamp):
+                node = track.nodes[bisect_right(track.begins, stamp) - 1]
+                return node, inverse(self.transforms[node]) @ matrices(track.at(stamp))
         return None
 
     def motion(self, start: int, end: int, robot: str = '') -> np.ndarray | None:
@@ -244,12 +218,11 @@ class KeyframeChain:
         :returns: stamps (m,), ns; transforms of the odometry and in the map, (m, 4, 4) each.
         """
         rows = [(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.int64))]
-        for recording in self._recordings:
-            if recording.robot != robot:
+        for track in self._tracks:
+            if track.robot != robot:
                 continue
-            stamps, poses = recording.track.kept
-            numbers = np.searchsorted(recording.begins, stamps, 'right') - 1
-            nodes = np.array(recording.nodes)[numbers]
+            stamps, poses = track.kept
+            nodes = np.array(track.nodes)[np.searchsorted(track.begins, stamps, 'right') - 1]
             is_solved = nodes < len(solved)
             rows.append((stamps[is_solved], matrices(poses[is_solved]), nodes[is_solved]))
         stamps, odometry, own = (np.concatenate(parts) for parts in zip(*rows, strict=True))
@@ -257,7 +230,7 @@ class KeyframeChain:
 
     def is_ahead(self, stamp: int, robot: str = '') -> bool:
         """Return whether odometry of this stamp may still arrive."""
-        return robot not in self._current or stamp > self._current[robot].tail[0]
+        return robot not in self._current or stamp > self._current[robot].newest[0]
 
     def starts(self) -> np.ndarray:
         """Return the first nodes of the sessions, in order of arrival."""
@@ -265,26 +238,24 @@ class KeyframeChain:
 
     def before(self, node: int) -> int:
         """Return the last keyframe of a robot before the first one of a session; -1 = none."""
-        if node in self._cuts:
-            return self._cuts[node]
-        number = int(self.recording[node])
-        earlier = self._recordings[:number]
-        robot = self._recordings[number].robot
-        own = [recording for recording in earlier if recording.robot == robot]
-        return own[-1].nodes[-1] if own else -1
+        if node in self.splits:
+            return self.splits[node]
+        number = self.recording[node]
+        robot, earlier = self._tracks[number].robot, self._tracks[:number]
+        return next((own.nodes[-1] for own in reversed(earlier) if own.robot == robot), -1)
 
     def split(self, node: int) -> None:
         """Begin a session at a node, its odometry in the middle of the time before."""
         later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
         self.sessions += 1
-        self._cuts[node] = before = int(self.previous[node])
+        self.splits[node] = before = int(self.previous[node])
         self.previous[node] = -1
         self._begin(node, int(self.stamps[[before, node]].mean()))
 
     def merge_session(self, node: int) -> None:
         """Undo the split at a node."""
-        end, before = self.session[node], self._cuts.pop(node)
+        end, before = self.session[node], self.splits.pop(node)
         self.session[self.session == end] = self.session[before]
         self.session[self.session > end] -= 1
         self.sessions -= 1
@@ -292,10 +263,5 @@ class KeyframeChain:
         self._begin(node, int(self.stamps[node]))
 
     def _begin(self, node: int, stamp: int) -> None:
-        recording = self._recordings[self.recording[node]]
-        recording.begins[recording.nodes.index(node)] = stamp
-
-    @property
-    def splits(self) -> list[int]:
-        """Return the first nodes of sessions that began by a split."""
-        return list(self._cuts)
+        track = self._tracks[self.recording[node]]
+        track.begins[track.nodes.index(node)] = stamp

@@ -49,6 +49,7 @@ class Network:
     :param closures: n closures; ``query`` and ``place`` are their nodes, (n,).
     :param links: first node of each session: the node that it is tied to loosely; -1 = it is an
         anchor.
+    :param freedom: of poses, 3 = in the plane, or 6; None = by the odometry.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Network:
         initial: np.ndarray,
         closures: ClosureArrays,
         links: Mapping[int, int],
+        freedom: int | None = None,
     ) -> None:
         self._chain, self._links = chain, links
         self.query, self.place = closures.query, closures.place
@@ -64,10 +66,10 @@ class Network:
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
-        T = chain.transforms
-        self._is_planar = bool(np.ptp(T[:, 2, 3]) < FLAT and np.abs(T[:, 2, :2]).max() < FLAT)
-        at = np.array(PLANAR if self._is_planar else range(6))
-        self.freedom = len(at)
+        z, tilt = chain.transforms[:, 2, 3], chain.transforms[:, 2, :2]
+        is_planar = np.ptp(z) < FLAT and np.abs(tilt).max() < FLAT
+        self.freedom = freedom or (3 if is_planar else 6)
+        at = np.array(PLANAR if self.freedom == 3 else range(6))
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
         self.room = room(initial, self.freedom)
         self._loose_determinant = float(np.log(loose).sum() / 2)
@@ -93,7 +95,8 @@ class Network:
             number[np.stack([starts, np.concatenate([variables, self.query])], axis=1)],
             np.concatenate([motions, closures.transform]), at,
         )  # fmt: skip
-        self._variables = variables
+        self.innovations = self._solver.innovations  # at the last variables
+        self._variables, self._at = variables, at
         self._covariance = self._runs.covariance[variables[self._inside]][:, at[:, None], at]
 
     def count_joins(self, numbers: np.ndarray) -> int:
@@ -131,25 +134,11 @@ class Network:
         """Return the squared deviations of the closures, shape (n,)."""
         return self._solver.linearize(values, odometry)[len(values) :]
 
-    def innovations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """
-        Return how closures differ from what the others expect, see :meth:`Solver.innovations`.
-
-        At the variables of the last residuals or fit.
-
-        :param weights: of all closures in that solution.
-        :param chosen: numbers of n closures.
-        """
-        before = len(self._variables)
-        whole = np.concatenate([np.ones(before), weights])
-        return self._solver.innovations(before, whole, chosen + before)
-
     def beside_odometry(self, chosen: np.ndarray) -> np.ndarray:
-        """Return the same of closures within sessions beside the odometry as stated alone."""
-        before, at = len(self._variables), self._solver.at
-        spread = self._chain.path_errors(self.query[chosen], self.place[chosen])
-        none = np.zeros(before + len(self.query))
-        return self._solver.innovations(before, none, chosen + before, spread[:, at[:, None], at])
+        """Return innovations of closures within sessions beside the odometry as stated alone."""
+        spread, at = self._chain.path_errors(self.query[chosen], self.place[chosen]), self._at
+        none = np.zeros(len(self.query))
+        return self.innovations(none, chosen, spread[:, at[:, None], at])
 
     def new_joins(self, accepted: np.ndarray) -> np.ndarray:
         """Return which closures join sessions that no accepted one joins, shape (n,), bool."""
@@ -161,11 +150,6 @@ class Network:
         deviations = self._solver.linearize(values, odometry)[: len(values)]
         worst = int(np.argmax(deviations))
         return int(self._variables[worst]), float(deviations[worst])
-
-    def _step(self, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the variables after a step from those of the last residuals."""
-        whole = np.concatenate([np.ones(len(values)), weights * (weights > NONE)])
-        return self._solver.step(values, whole)
 
     def robust(
         self, odometry: np.ndarray, values: np.ndarray, start: float = 0.0
@@ -183,7 +167,7 @@ class Network:
         weights, limit = np.ones(len(self.query)), self.limit
         errors = self.residuals(odometry, values)
         for _ in range(0 if start else tuning.FIRST_STEPS):
-            values, _ = self._step(values, weights)
+            values, _ = self._solver.step(values, weights)
             errors = self.residuals(odometry, values)
         if 2 * errors.max(initial=0.0) <= limit:
             return weights > 0, values
@@ -192,7 +176,7 @@ class Network:
             surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
             between = np.sqrt(limit * mu * (mu + 1) / errors.clip(surely)) - mu
             weights = np.where(errors >= never, 0.0, np.where(errors <= surely, 1.0, between))
-            values, _ = self._step(values, weights)
+            values, _ = self._solver.step(values, weights * (weights > NONE))
             if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
                 break
             errors, mu = self.residuals(odometry, values), mu * tuning.GROWTH
@@ -215,7 +199,7 @@ class Network:
         whole = np.concatenate([np.ones(len(values), bool), counted])
         error = float(self._solver.linearize(values, odometry)[whole].sum())
         for _ in range(steps):
-            values, determinant = self._step(values, counted * 1.0)
+            values, determinant = self._solver.step(values, counted * 1.0)
             before, error = error, float(self._solver.linearize(values, odometry)[whole].sum())
             if abs(before - error) < 2 * tuning.CONVERGED:
                 break

@@ -11,7 +11,7 @@ two keyframes is the difference of two sums, whatever its shape.
 from dataclasses import dataclass
 
 import numpy as np
-from stavpr_ros.mapping.transforms import cross
+from stavpr_slam.pose_graph.transforms import adjoints, body_covariance
 
 SHORTEST = 0.05  # meters that a step counts at least
 NEGLIGIBLE = 1e-6  # part of a covariance below which it is numerical noise
@@ -39,12 +39,12 @@ def step_errors(ends: np.ndarray, noise: OdometryNoise) -> np.ndarray:
 
     :param ends: the two keyframes in these axes, shape (2, 4, 4).
     """
-    lever = cross((ends[:1, :3, 3] + ends[1:, :3, 3]) / 2)[0]
     length = float(np.linalg.norm(ends[1, :3, 3] - ends[0, :3, 3]))
-    moves = np.concatenate([np.eye(3), lever])
-    spread: np.ndarray = noise.rotation**2 * moves @ moves.T
-    spread[3:, 3:] += noise.translation**2 * np.eye(3)
-    return max(length, SHORTEST) * spread
+    middle = np.eye(4)[None]
+    middle[0, :3, 3] = ends[:, :3, 3].mean(axis=0)
+    moved = adjoints(middle)[0] * np.repeat([noise.rotation, noise.translation], 3)
+    spread: np.ndarray = max(length, SHORTEST) * moved @ moved.T
+    return spread
 
 
 def message_growth(
@@ -54,18 +54,14 @@ def message_growth(
     Return how far covariances of messages grow in a step, in the axes of the start, (6, 6).
 
     :param before, after: as in ``geometry_msgs/PoseWithCovariance``, shape (6, 6).
-    :returns: None where they are unknown, or do not grow as those of a filter.
+    :returns: None where they are unknown, or do not grow as a filter's do.
     """
     if before is None or after is None:
         return None
     if not (np.abs([before, after]) <= LARGEST_COVARIANCE).all():  # NaN as well
         return None
-    sums = []
-    for covariance, pose in zip((before, after), ends, strict=True):
-        change = np.zeros((6, 6))
-        change[:3, 3:] = change[3:, :3] = np.eye(3)
-        change[3:, 3:] = cross(pose[None, :3, 3])[0]
-        sums.append(change @ covariance @ change.T)
-    growth: np.ndarray = sums[1] - sums[0]
+    turns = adjoints(ends)
+    own = [body_covariance(*row) for row in zip((before, after), ends, strict=True)]
+    growth: np.ndarray = np.diff(turns @ own @ turns.mT, axis=0)[0]
     values = np.linalg.eigvalsh((growth + growth.T) / 2)
     return growth if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None

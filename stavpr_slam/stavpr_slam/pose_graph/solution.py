@@ -36,11 +36,6 @@ class Solution:
     scales: np.ndarray
     placement: Placement
 
-    @property
-    def rejected(self) -> int:
-        """Return the number of rejected closures."""
-        return int((~self.accepted).sum())
-
 
 @dataclass(frozen=True, eq=False)
 class DriveSolution(Solution):

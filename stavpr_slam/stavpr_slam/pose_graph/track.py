@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The odometry between keyframes, without the poses that interpolation gives."""
 
+from array import array
+from bisect import bisect_right
 import math
 
 import numpy as np
@@ -14,18 +16,23 @@ MOST = 32  # poses kept after a keyframe: an odometry that jitters needs no more
 
 class OdometryTrack:
     """
-    Stamps and poses of a recording, keyframes among them; others in between are interpolated.
+    Odometry without a break, of one robot: the poses that are not interpolated, and keyframes.
+
+    ``newest`` is the stamp (ns) and the pose of the newest odometry, ``spread`` the covariance in
+    the message of the last keyframe, (6, 6), ``nodes`` the keyframes, and ``begins`` the stamps
+    from which odometry moves with each.
 
     :param distance, angle: meters and radians between keyframes.
     """
 
-    def __init__(self, distance: float, angle: float) -> None:
-        self._distance, self._angle = distance, angle
-        self._stamps = np.zeros(64, np.int64)
-        self._poses = np.zeros((64, 7))
-        self._count = 0
+    def __init__(self, distance: float, angle: float, robot: str = '') -> None:
+        self._distance, self._angle, self.robot = distance, angle, robot
+        self._stamps, self._poses = array('q'), array('d')
         self._since = 0  # poses kept since the last keyframe
-        self._newest: tuple[int, np.ndarray] | None = None
+        self.newest = 0, np.zeros(7)
+        self.spread: np.ndarray | None = None
+        self.nodes: list[int] = []
+        self.begins: list[int] = []
 
     def add(self, stamp: int, pose: np.ndarray, is_keyframe: bool) -> None:
         """
@@ -34,12 +41,12 @@ class OdometryTrack:
         :param stamp: ns, above those before.
         :param pose: shape (7,).
         """
-        newest, self._newest = self._newest, (stamp, pose)
-        if not self._count:
+        newest, self.newest = self.newest, (stamp, pose)
+        if not self._stamps:
             self._keep(stamp, pose)
             return
-        last, start = int(self._stamps[self._count - 1]), self._poses[self._count - 1]
-        if newest is not None and newest[0] > last and self._since < MOST:
+        last, start = self._stamps[-1], self._pose(-1)
+        if newest[0] > last and self._since < MOST:
             expected = interpolate(start, pose, (newest[0] - last) / (stamp - last))
             if self._differ(expected, newest[1], OFF):
                 self._keep(*newest)
@@ -56,32 +63,28 @@ class OdometryTrack:
         )
 
     def _keep(self, stamp: int, pose: np.ndarray) -> None:
-        if self._count == len(self._stamps):
-            self._stamps = np.concatenate([self._stamps, np.zeros_like(self._stamps)])
-            self._poses = np.concatenate([self._poses, np.zeros_like(self._poses)])
-        self._stamps[self._count], self._poses[self._count] = stamp, pose
-        self._count += 1
+        self._stamps.append(stamp)
+        self._poses.extend(pose.tolist())
         self._since += 1
+
+    def _pose(self, i: int) -> np.ndarray:
+        return np.array(self._poses[7 * i : 7 * i + 7 or None])
 
     @property
     def kept(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the stamps, (n,), int64, ns, and poses, (n, 7), that are kept."""
-        return self._stamps[: self._count], self._poses[: self._count]
+        return np.array(self._stamps), np.array(self._poses).reshape(-1, 7)
 
-    @property
-    def span(self) -> tuple[int, int]:
-        """Return the first and the last stamp, ns; of nothing (1, 0)."""
-        return (int(self._stamps[0]), self._newest[0]) if self._newest else (1, 0)
+    def has(self, stamp: int) -> bool:
+        """Return whether a stamp is between the first and the newest one."""
+        return self._stamps[0] <= stamp <= self.newest[0]
 
     def at(self, stamp: int) -> np.ndarray:
-        """Return the pose at a stamp within the span, shape (7,)."""
-        stamps, poses = self.kept
-        i = int(np.searchsorted(stamps, stamp, 'right')) - 1
-        if stamps[i] == stamp:
-            return np.asarray(poses[i])
-        if i + 1 < len(stamps):
-            after, pose = int(stamps[i + 1]), poses[i + 1]
-        else:
-            assert self._newest is not None
-            after, pose = self._newest
-        return interpolate(poses[i], pose, (stamp - int(stamps[i])) / (after - int(stamps[i])))
+        """Return the pose at a stamp that it has, shape (7,)."""
+        i = bisect_right(self._stamps, stamp) - 1
+        start, after = self._stamps[i], self.newest
+        if start == stamp:
+            return self._pose(i)
+        if i + 1 < len(self._stamps):
+            after = self._stamps[i + 1], self._pose(i + 1)
+        return interpolate(self._pose(i), after[1], (stamp - start) / (after[0] - start))

@@ -5,6 +5,9 @@
 import numpy as np
 from stavpr_ros.mapping.transforms import cross
 
+ORDER = [3, 4, 5, 0, 1, 2]
+TRANSLATION_FIRST = np.ix_(ORDER, ORDER)  # of a matrix that has the rotation first, or the reverse
+
 
 def planar_poses(poses: np.ndarray) -> np.ndarray:
     """Return planar poses (N, 3), x y and yaw in radians, as poses (N, 7)."""

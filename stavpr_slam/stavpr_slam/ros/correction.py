@@ -13,7 +13,7 @@ MAX_SECONDS = 1.0  # between two stamps; longer pauses of the odometry count as 
 
 class LimitedCorrection:
     """
-    Moves the corrected pose of the robot toward that of the graph, on SE(3) about the robot.
+    Moves the corrected pose of the robot toward its pose in the graph, on SE(3) about the robot.
 
     :param speed: m/s; the rotation has ``speed / LEVER`` rad/s; 0 = at once.
     """

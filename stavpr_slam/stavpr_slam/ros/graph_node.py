@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 import gc
-import math
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -20,6 +19,7 @@ from rclpy.qos import QoSProfile
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
+from stavpr_ros.checks import require_above, require_at_least
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
@@ -104,11 +104,9 @@ class PoseGraphNode(ManagedNode):
         self._appearance = bool(values['appearance_edges'])
         self._folder = maps_folder(values['maps_folder'])
         for name in ('keyframe_distance', 'max_odometry_gap'):
-            if not (math.isfinite(values[name]) and values[name] > 0):
-                raise SettingsError(f'{name} = {values[name]}: expected a number above 0')
+            require_above(name, values[name], 0)
         self._speed, self._robots = values['max_correction_speed'], list(values['robots'])
-        if not (math.isfinite(self._speed) and self._speed >= 0):
-            raise SettingsError(f'max_correction_speed = {self._speed}: expected 0 or more m/s')
+        require_at_least('max_correction_speed', self._speed, 0, 'm/s')
         if len({*self._robots}) < max(len(self._robots), 1):
             raise SettingsError(f'robots = {self._robots}: expected different names, or one ""')
         gc.freeze()  # collecting what is imported would take .15 s, without any odometry
@@ -164,17 +162,17 @@ class PoseGraphNode(ManagedNode):
         """Subscribe."""
         result = super().on_activate(state)
         group = MutuallyExclusiveCallbackGroup()
-
-        def subscribe(kind: type, topic: str, use: Callable[..., None], qos: QoSProfile) -> None:
-            self._entities.append(
-                self.create_subscription(kind, topic, use, qos, callback_group=group)
+        topics: list[tuple[type, str, Callable[..., None], QoSProfile]] = [
+            (
+                Odometry,
+                f'{robot}/odom'.lstrip('/'),
+                partial(self._on_odometry, robot),
+                ODOMETRY_QOS,
             )
-
-        for robot in self._robots:
-            topic = f'{robot}/odom'.lstrip('/')
-            subscribe(Odometry, topic, partial(self._on_odometry, robot), ODOMETRY_QOS)
-        for topic in self._topics:
-            subscribe(LoopClosure, topic, self._on_closure, CLOSURE_QOS)
+            for robot in self._robots
+        ]
+        topics += [(LoopClosure, topic, self._on_closure, CLOSURE_QOS) for topic in self._topics]
+        self._entities = [self.create_subscription(*row, callback_group=group) for row in topics]
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -186,9 +184,8 @@ class PoseGraphNode(ManagedNode):
         """Forget the graph."""
         self._stop()
         self._forget()
-        for publisher in self._made_publishers:
-            self.destroy_publisher(publisher)
-        self._made_publishers = []
+        while self._made_publishers:
+            self.destroy_publisher(self._made_publishers.pop())
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -203,9 +200,8 @@ class PoseGraphNode(ManagedNode):
         super().destroy_node()
 
     def _unsubscribe(self) -> None:
-        for subscription in self._entities:
-            self.destroy_subscription(subscription)
-        self._entities = []
+        while self._entities:
+            self.destroy_subscription(self._entities.pop())
 
     def _stop(self) -> None:
         self._unsubscribe()
@@ -307,12 +303,11 @@ class PoseGraphNode(ManagedNode):
                 f'(evidence -{snapshot.values["evidence_against_correction"]})',
                 throttle_duration_sec=10.0,
             )
-        if snapshot.paths is not None and self.state == 'active':
-            trajectories, *edges = snapshot.paths
-            for robot, (stamps, *both) in trajectories.items():
+        if snapshot.trajectories and self.state == 'active':
+            for robot, (stamps, *both) in snapshot.trajectories.items():
                 for publisher, poses in zip(self._paths[robot], both, strict=True):
                     publisher.publish(path_bytes(self._frame, stamps, poses))
-            self._edges.publish(edge_markers(self._frame, *edges))
+            self._edges.publish(edge_markers(self._frame, *snapshot.edges))
 
     def _on_lost(self, problem: str) -> None:
         self._lost = self._problems['process'] = problem

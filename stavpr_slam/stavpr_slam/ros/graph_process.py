@@ -32,6 +32,7 @@ PERIOD = 1.0  # seconds between two requests without closures, and at least betw
 MAX_WAITING = 100_000  # odometry and closures that wait for the child
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 STOP_SECONDS = 3.0  # for the thread to end once the child is killed
+Trajectory = tuple[np.ndarray, np.ndarray, np.ndarray]  # stamps, odometry, corrected poses
 
 
 class RobotOdometry(NamedTuple):
@@ -48,20 +49,6 @@ class RobotOdometry(NamedTuple):
     covariance: list[float] | None
 
 
-class Paths(NamedTuple):
-    """
-    The trajectories, and the edges between them.
-
-    :param trajectories: stamps, ns, (n,), poses of the odometry and corrected ones, (n, 7) each,
-        by robot.
-    :param accepted, rejected: x y z of the ends of the edges, (m, 2, 3).
-    """
-
-    trajectories: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
-    accepted: np.ndarray
-    rejected: np.ndarray
-
-
 class Snapshot(NamedTuple):
     """
     The graph after a request.
@@ -72,6 +59,8 @@ class Snapshot(NamedTuple):
     :param invalid: kind, ``odometry`` or ``closures``, and reason of each rejected input.
     :param failure: why the solution failed; empty = it did not.
     :param saved: nodes written, or why they were not.
+    :param trajectories: (n,), ns, and (n, 7) each, by robot; empty where they are not requested.
+    :param edges: x y z of the ends of accepted and of rejected edges, (m, 2, 3) each.
     """
 
     corrections: dict[str, np.ndarray]
@@ -80,7 +69,8 @@ class Snapshot(NamedTuple):
     invalid: list[tuple[str, str]]
     failure: str
     saved: int | str
-    paths: Paths | None
+    trajectories: dict[str, Trajectory]
+    edges: list[np.ndarray]
 
 
 class GraphServer:
@@ -106,7 +96,8 @@ class GraphServer:
 
         :param save: file of the solution, and whether to overwrite it; None = no file.
         """
-        graph, failure, paths, invalid = self._graph, '', None, []
+        graph, failure, invalid = self._graph, '', []
+        trajectories, edges = dict[str, Trajectory](), list[np.ndarray]()
         saved: int | str = 0
         for item in inputs:
             try:
@@ -122,12 +113,13 @@ class GraphServer:
             for robot, origin in self._origins.items():
                 self._corrections[robot] = matrices(graph.map_to_odom(robot)) @ origin
             if with_paths and len(graph.solved):
-                paths = self._paths()
+                trajectories, edges = self._paths()
         except Exception as error:  # one solution failed: the next may succeed
             failure = saved = f'{type(error).__name__}: {error}'
         return Snapshot(
-            self._corrections, self._values(), graph.chain.breaks, invalid, failure, saved, paths
-        )
+            self._corrections, self._values(), graph.chain.breaks, invalid, failure, saved,
+            trajectories, edges,
+        )  # fmt: skip
 
     def _add(self, item: RobotOdometry | Closure) -> None:
         if isinstance(item, Closure):
@@ -168,16 +160,14 @@ class GraphServer:
             'evidence_against_correction': f'{graph.refused:.1f}',
         }
 
-    def _paths(self) -> Paths:
-        graph, solved = self._graph, self._graph.solved
-        trajectories = {}
+    def _paths(self) -> tuple[dict[str, Trajectory], list[np.ndarray]]:
+        graph, solved, trajectories = self._graph, self._graph.solved, {}
         for robot in self._origins:
             stamps, before, after = graph.chain.trajectory(solved, robot)
             trajectories[robot] = stamps, to_poses(before), to_poses(after)
-        edges = [e for e in graph.edges if max(e.query, e.place) < len(solved)]
-        ends = np.array([(e.query, e.place) for e in edges], int).reshape(-1, 2)
-        is_accepted, points = np.array([e.accepted for e in edges], bool), solved[ends, :3, 3]
-        return Paths(trajectories, points[is_accepted], points[~is_accepted])
+        rows = np.array([(e.query, e.place, e.accepted) for e in graph.edges], int).reshape(-1, 3)
+        points = solved[rows[:, :2], :3, 3]
+        return trajectories, [points[rows[:, 2] == 1], points[rows[:, 2] == 0]]
 
 
 def run_server(connection: Connection, parent: int, *arguments: Any) -> None:
@@ -299,7 +289,7 @@ class GraphProcess:
                 if self._is_ending:
                     raise EOFError
                 self._origins = snapshot.corrections
-            if snapshot.paths is not None:
+            if snapshot.trajectories:
                 self._has_changed, self._paths_due = False, time.monotonic() + PERIOD
             self._on_snapshot(snapshot)
             return snapshot

@@ -4,16 +4,17 @@
 
 from collections import Counter
 import importlib
-import math
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.errors import InputError, SettingsError, UnavailableError
+from stavpr_ros.checks import require_above
+from stavpr_ros.errors import InputError, UnavailableError
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_slam.ros.graph_messages import CLOSURE_QOS
+from stavpr_slam.pose_graph import Closure
+from stavpr_slam.ros.graph_messages import closure_of, CLOSURE_QOS
 
 PERIOD = 1.0  # seconds between two diagnostics
 REMEDIES = {
@@ -56,6 +57,7 @@ class Bridge(Node):
     """
 
     NAME: ClassVar[str]
+    IS_ON_MAP: ClassVar[bool]  # whether it passes on the closures on a map, or of the drive
     PARAMETERS: ClassVar[dict[str, tuple[Any, str]]]
 
     def __init__(self) -> None:
@@ -64,31 +66,34 @@ class Bridge(Node):
             name: self.declare_parameter(name, default).value
             for name, (default, _) in self.PARAMETERS.items()
         }
+        for name, value in self.given.items():
+            if isinstance(value, float):
+                require_above(name, value, 0)
         self.counts: Counter[str] = Counter()
         self.create_subscription(LoopClosure, 'stavpr/loop_closure', self._on_closure, CLOSURE_QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, self.on_timer, clock=steady)
 
-    def seconds(self, name: str) -> float:
-        """
-        Return a parameter.
-
-        :raises SettingsError: it is not a number above 0.
-        """
-        value = self.given[name]
-        if not (math.isfinite(value) and value > 0):
-            raise SettingsError(f'{name} = {value}: expected a number of seconds above 0')
-        return float(value)
-
-    def take(self, message: LoopClosure) -> str:
-        """Pass a closure on; return why it is not, empty = it is, or waits."""
+    def take(self, message: LoopClosure, closure: Closure) -> str:
+        """Pass a valid closure on; return why it is not, empty = it is, or waits."""
         raise NotImplementedError
+
+    def _cause(self, message: LoopClosure) -> str:
+        """Return why a closure is not passed on."""
+        relative, closure = message.relative_pose, closure_of(message)
+        if (message.query_index < 0) != self.IS_ON_MAP or message.has_poses < self.IS_ON_MAP:
+            return 'not_on_a_map' if self.IS_ON_MAP else 'on_a_map'
+        if closure is None:
+            return 'without_relative_pose'
+        if self.given['pnp_only'] and relative.source != relative.PNP:
+            return 'not_pnp'
+        return self.take(message, closure.checked())
 
     def _on_closure(self, message: LoopClosure) -> None:
         self.counts['closures'] += 1
         try:
-            cause = self.take(message)
+            cause = self._cause(message)
         except InputError as error:
             cause = 'invalid'
             self.get_logger().warning(f'closure rejected: {error}', throttle_duration_sec=10.0)

@@ -7,22 +7,22 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.ros.messages import nanoseconds, pose_message
 from stavpr_ros.units import SECOND
+from stavpr_slam.pose_graph import Closure
 from stavpr_slam.ros.bridges.bridge import Bridge
-from stavpr_slam.ros.graph_messages import closure_of, pose_array
 
 
 class PoseBridge(Bridge):
     """
     Publishes the pose of the query in the frame of the map, by the place and the relative pose.
 
-    The covariance is that of the relative pose; the poses of the map count as exact.
+    The covariance is of the relative pose; the poses of the map count as exact.
     """
 
     TOPIC: ClassVar[str]
+    IS_ON_MAP = True
     PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {
         'pnp_only': (False, 'only poses by PnP, none that are aligned by odometry'),
     }
@@ -39,23 +39,16 @@ class PoseBridge(Bridge):
         """Return why a pose is left out, empty = it is not."""
         return '' if message.relative_pose.is_independent else 'not_independent'
 
-    def take(self, message: LoopClosure) -> str:
+    def take(self, message: LoopClosure, closure: Closure) -> str:
         """Publish the pose of a closure on a map."""
-        relative = message.relative_pose
-        if message.query_index >= 0 or not message.has_poses:
-            return 'not_on_a_map'
-        closure = closure_of(message, appearance=False)
-        if closure is None:
-            return 'without_relative_pose'
-        if self.given['pnp_only'] and relative.source != relative.PNP:
-            return 'not_pnp'
-        closure = closure.checked()
         if cause := self.reason_to_skip(message):
             return cause
-        place = matrices(normalize_pose(pose_array(message.place_pose)))
+        assert closure.place_pose is not None
+        place = matrices(closure.place_pose)
         turn = np.kron(np.eye(2), place[:3, :3])
         result = PoseWithCovarianceStamped()
-        result.header.stamp, result.header.frame_id = relative.query_stamp, self.frame(message)
+        result.header.stamp = message.relative_pose.query_stamp
+        result.header.frame_id = self.frame(message)
         result.pose.pose = pose_message(to_poses(place @ matrices(closure.pose)))
         result.pose.covariance = (turn @ closure.covariance @ turn.T).ravel()
         self._publisher.publish(result)
@@ -82,7 +75,7 @@ class RobotLocalizationBridge(PoseBridge):
 
     def __init__(self) -> None:
         super().__init__()
-        self._gap = round(self.seconds('relocalization_gap') * SECOND)
+        self._gap = round(self.given['relocalization_gap'] * SECOND)
         self._last = -self._gap - 1
 
     def reason_to_skip(self, message: LoopClosure) -> str:
