@@ -130,11 +130,7 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
 
 
 class _Images:
-    """
-    Every N-th image of a source; counts the images that were read.
-
-    :param yaw: degrees to the left by which panoramas are turned, 0 = as they are.
-    """
+    """Every N-th image of a source, turned to the left by a yaw, degrees; counts those read."""
 
     def __init__(
         self, source: 'FolderSource | VideoSource | BagSource', every: int, yaw: float = 0.0

@@ -430,11 +430,7 @@ def _update(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _drive(arguments: argparse.Namespace, place_map: 'Map') -> 'Iterator[Map]':
-    """
-    Yield the images of a drive, with the features of a map.
-
-    They are in a journal: an interrupted update continues there.
-    """
+    """Yield the images of a drive, with the features of a map; a journal keeps them meanwhile."""
     from stavpr_ros.mapping import is_map, load_map
     from stavpr_ros.mapping.builder import build_journal
     from stavpr_ros.mapping.journal_map import journal_map

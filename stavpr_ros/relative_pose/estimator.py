@@ -111,11 +111,7 @@ class EdgeEstimator:
         return replace(edge, reason=reason, pose=turn_pose(edge.pose, pair.relative_yaw))
 
     def _pnp(self, pair: MatchedPair, query_camera: Camera, place_camera: Camera) -> Edge:
-        """
-        Return the edge by PnP, or one that it refutes.
-
-        :raises InputError: the images or their surroundings do not permit PnP.
-        """
+        """Return the edge by PnP, or one that it refutes; InputError where it is impossible."""
         query, landmarks, reach = self._query_and_landmarks(pair, query_camera, place_camera)
         result = solve_pnp(query, landmarks)
         if result.matrix is None:
@@ -133,11 +129,7 @@ class EdgeEstimator:
     def _query_and_landmarks(
         self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
     ) -> tuple[View, list[Landmarks], float]:
-        """
-        Return the query, landmarks in the frame of the place, and how far they serve (m).
-
-        :raises InputError: the intrinsics are of another size, or the place has no neighbors.
-        """
+        """Return the query, landmarks in the frame of the place, and how far they serve (m)."""
         assert pair.query is not None
         source = self._source
         if source is None or source[0] is not pair.source or source[1] != place_camera:

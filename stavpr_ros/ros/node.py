@@ -346,11 +346,7 @@ class PlaceRecognitionNode(ManagedNode):
         )
 
     def _publish_map_info(self, state: str = '', path: str = '') -> None:
-        """
-        Publish the description of the map, if any, where it has changed.
-
-        :param state: of a node that is not configured, '' = of the map in use; path: of its file.
-        """
+        """Publish the description of the map where it has changed; by a state, of none in use."""
         with self._info_lock:  # in the order of the changes
             if state:
                 operation, robot_id = self.settings.operation, self.settings.robot_id
