@@ -21,10 +21,8 @@ from stavpr_ros.output_file import MAP, require_replaceable
 if TYPE_CHECKING:
     import numpy as np
     from stavpr_ros.mapping import Map, Trajectory
-    from stavpr_ros.sources.bag import BagSource
-    from stavpr_ros.sources.folder import FolderSource
+    from stavpr_ros.sources import Source
     from stavpr_ros.sources.frame import Frame
-    from stavpr_ros.sources.video import VideoSource
 
 RULES = {  # fields of KeyframeSettings
     'interval': ('S', 'seconds since the last place; for videos and bags'),
@@ -132,9 +130,7 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
 class _Images:
     """Every N-th image of a source, turned to the left by a yaw, degrees; counts those read."""
 
-    def __init__(
-        self, source: 'FolderSource | VideoSource | BagSource', every: int, yaw: float = 0.0
-    ) -> None:
+    def __init__(self, source: 'Source', every: int, yaw: float) -> None:
         self.source, self._every, self._yaw = source, every, yaw
         self.read = 0
 
@@ -182,9 +178,7 @@ def _check(arguments: argparse.Namespace) -> None:
     require_replaceable(arguments.output, MAP, arguments.force)
 
 
-def _poses(
-    arguments: argparse.Namespace, source: 'FolderSource | VideoSource | BagSource'
-) -> 'np.ndarray | Trajectory | None':
+def _poses(arguments: argparse.Namespace, source: 'Source') -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.pose_file import read_poses
