@@ -137,15 +137,6 @@ def open_journal(
         return None
 
 
-def close_journals(pipeline: Pipeline, delete_route: bool, log: 'Logger | Any') -> None:
-    """Close the journals of a pipeline that ends; log those with unsaved places."""
-    for path in pipeline.close_journals(delete_route):
-        log.warning(
-            f'unsaved places stay in {path}: the next start of the node makes a map of them, '
-            'or `stavpr map recover`'
-        )
-
-
 def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:
     """Write the map to the path, or the first numbered name that is free or of this map."""
     for name in map(str, numbered_names(path)):

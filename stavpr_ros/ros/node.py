@@ -24,7 +24,7 @@ from stavpr_ros.memory import give_back
 from stavpr_ros.parameters import BY_NAME, RENAMED
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
+from stavpr_ros.ros.diagnostics import publish_diagnostics
 from stavpr_ros.ros.health import Health, INVALID
 from stavpr_ros.ros.parameters import (
     convert_type,
@@ -84,9 +84,8 @@ class PlaceRecognitionNode(ManagedNode):
         self._jumps = self.get_clock().create_jump_callback(
             backwards, post_callback=self._on_clock_jump
         )
-        self._diagnostics = DiagnosticsPublisher(
-            self, self.settings.diagnostics_period, self._health
-        )
+        period = self.settings.diagnostics_period
+        self._diagnostics = publish_diagnostics(self, period, self._health)
         self._start: Timer | None = None
         if self.settings.autostart:
             group = MutuallyExclusiveCallbackGroup()

@@ -17,7 +17,6 @@ from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
-    close_journals,
     open_journal,
     recover_maps,
     save_recorded_map,
@@ -174,8 +173,11 @@ class Runtime:
                 self._node.left_behind = True
             self._maps.stop()
             if self._pipeline is not None:
-                delete_route = not self.settings.save_path
-                close_journals(self._pipeline, delete_route, self._node.get_logger())
+                for path in self._pipeline.close_journals(not self.settings.save_path):
+                    self._node.get_logger().warning(
+                        f'unsaved places stay in {path}: the next start of the node makes a map '
+                        'of them, or `stavpr map recover`'
+                    )
             self._end_bond()
             self._publication.close()
 
@@ -316,11 +318,9 @@ class Runtime:
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
         self._statistics.add_drop(cause)
-        result, robot_id = (
-            self.pipeline.operation.unmatched(status, reason),
-            self.settings.robot_id,
-        )
-        outcome = Outcome(message.header, result, self.pipeline.places, robot_id=robot_id)
+        pipeline, robot_id = self.pipeline, self.settings.robot_id
+        result = pipeline.operation.unmatched(status, reason)
+        outcome = Outcome(message.header, result, pipeline.places, robot_id=robot_id)
         self._publication.output.publish(outcome)
 
     def _process(self, item: _Item) -> None:
