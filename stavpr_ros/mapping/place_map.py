@@ -16,7 +16,7 @@ from stavpr_ros.checks import require_at_least, require_shape, require_type, rgb
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.jpeg import is_thumbnail, MAX_THUMBNAIL_PIXELS
+from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.sources import open_source
 from stavpr_ros.units import SECOND
 
@@ -402,9 +402,10 @@ def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
 
 def decode_thumbnail(content: bytes) -> np.ndarray | None:
     """Return the image of a thumbnail, RGB (h, w, 3) uint8; None of an empty or damaged one."""
-    if not is_thumbnail(content):
+    data = np.frombuffer(content, np.uint8)
+    if not 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MAX_THUMBNAIL_PIXELS:
         return None
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
