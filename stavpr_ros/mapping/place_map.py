@@ -389,6 +389,12 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
+def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return an image at a width and a height; its pixels are averaged where it is wider."""
+    shrinks = image.shape[1] > size[0]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
 def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     """Return :func:`thumbnail_of` an image as a JPEG."""
     return encode_jpeg(thumbnail_of(image, width), 85)
