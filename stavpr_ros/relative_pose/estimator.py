@@ -142,17 +142,13 @@ class EdgeEstimator:
             if abs(index - pair.place) <= LANDMARK_RADIUS:
                 beside, _, _ = self._landmarks_of(pair, index, place_camera)
                 landmarks.append(beside.transform(inverse(motion)))
-        return self._view(pair.query, query_camera), landmarks, reach
+        return view_of(pair.query, query_camera), landmarks, reach
 
     def _landmarks_of(
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
         make = partial(self._triangulate, pair, place, camera)
         return _get_or_make(self._landmarks, place, LANDMARKS, make)
-
-    def _view(self, image: np.ndarray, camera: Camera) -> View:
-        camera.require_fitting(image.shape[1], image.shape[0])
-        return view_of(image, camera)
 
     def _triangulate(
         self, pair: MatchedPair, place: int, camera: Camera
@@ -183,7 +179,7 @@ class EdgeEstimator:
 
         def make() -> View | None:
             image = decode_thumbnail(pair.thumbnails[index])
-            return None if image is None else self._view(image, camera)
+            return None if image is None else view_of(image, camera)
 
         return _get_or_make(self._views, index, VIEWS, make)
 
