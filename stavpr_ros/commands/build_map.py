@@ -109,13 +109,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar='DEG',
         help='turn 360-degree images to the left; 180: as the robot takes them on its return',
     )
-    _add_keyframe_options(parser)
-    add_job_options(parser)
-    add_feature_options(parser)
-    return parser
-
-
-def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         'keyframes',
         'Only images that differ enough from the last place become places. All rules must be\n'
@@ -125,6 +118,9 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
         group.add_argument(
             f'--keyframe-{name}', type=float, default=0.0, metavar=metavar, help=text
         )
+    add_job_options(parser)
+    add_feature_options(parser)
+    return parser
 
 
 class _Images:

@@ -76,12 +76,7 @@ exit codes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run the command.
-
-    :param arguments: without the program's name; the process's own if None.
-    :returns: exit code, see ``--help``.
-    """
+    """Run the command."""
     args = list(sys.argv[1:] if arguments is None else arguments)
     codes: dict[type[StavprError], int] = {
         NoSubscriberError: NO_SUBSCRIBER,

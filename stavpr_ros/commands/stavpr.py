@@ -58,12 +58,7 @@ def forget_requirements() -> None:
 
 
 def main(args: list[str] | None = None) -> int:
-    """
-    Run a command.
-
-    :param args: arguments without the program name; None takes the arguments of the process.
-    :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
-    """
+    """Run a command; return its exit code, 2 for a usage error or a missing ROS installation."""
     forget_requirements()
     return run_program('stavpr', lambda: _main(sys.argv[1:] if args is None else args))
 
