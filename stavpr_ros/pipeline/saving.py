@@ -124,12 +124,7 @@ def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -
 def open_journal(
     target: Path, base: Base, template: Map, log: 'Logger | Any'
 ) -> JournalWriter | None:
-    """
-    Open the journal of the first unsaved place; None, and an error in the log, if it fails.
-
-    :param target: file that the map is saved to.
-    :param base: saved places that the recorded ones continue; template: a map of the new place.
-    """
+    """Open the journal of the first unsaved place; None, and an error in the log, if it fails."""
     try:
         return JournalWriter.create(target, base, template, log.error)
     except JournalError as error:

@@ -241,21 +241,11 @@ class PlaceRecognitionNode(ManagedNode):
             return self._reject(error)
 
     def load_map(self, path: str, verify: bool = False) -> None:
-        """
-        Load a map and use it.
-
-        :param verify: compare its hashes before it is used, not later.
-        :raises StavprError: the node is not configured, or the map is invalid; the old one stays
-            in use.
-        """
+        """Load a map and use it, :meth:`stavpr_ros.ros.map_loading.MapLoader.load`."""
         self.runtime.load(path, self._lock, verify)
 
     def set_operation(self, operation: str) -> None:
-        """
-        Change the operation.
-
-        :raises StavprError: the node is not configured, or the operation cannot be changed.
-        """
+        """Change the operation, :meth:`stavpr_ros.ros.runtime.Runtime.change`."""
         with self._lock:
             runtime, settings = self.runtime, self._settings_with({'operation': operation})
             runtime.change(settings)
@@ -272,11 +262,17 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _validate_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Check all parameters together; change nothing."""
-        changes = {row.name: row.value for row in parameters if row.name in BY_NAME}
+        values = {row.name: row.value for row in parameters if row.name in BY_NAME}
+        if not values:
+            return SetParametersResult(successful=True)
         try:
-            if changes:
-                with self._lock:
-                    self._require_valid(changes)
+            with self._lock:
+                changes = {n: v for n, v in values.items() if v != self.get_parameter(n).value}
+                if self._runtime is not None:
+                    require_changeable(changes, self.state)
+                settings = self._settings_with(changes)
+                if settings.save_path != self.settings.save_path:
+                    require_writable(settings.save_path)
         except StavprError as error:
             return self._reject(error)
         return SetParametersResult(successful=True)
@@ -284,15 +280,6 @@ class PlaceRecognitionNode(ManagedNode):
     def _reject(self, error: StavprError) -> SetParametersResult:
         self.get_logger().error(f'parameters rejected: {error}')
         return SetParametersResult(successful=False, reason=str(error))
-
-    def _require_valid(self, values: dict[str, Any]) -> None:
-        current = {name: self.get_parameter(name).value for name in values}
-        changes = {name: value for name, value in values.items() if value != current[name]}
-        if self._runtime is not None:
-            require_changeable(changes, self.state)
-        settings = self._settings_with(changes)
-        if settings.save_path != self.settings.save_path:
-            require_writable(settings.save_path)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         """Apply validated parameters; try to start again where the last try failed."""

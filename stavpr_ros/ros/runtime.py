@@ -222,13 +222,7 @@ class Runtime:
     def load(
         self, path: str, lock: AbstractContextManager[Any] | None = None, verify: bool = False
     ) -> None:
-        """
-        Load a map and use it; meanwhile the old one stays in use.
-
-        :param lock, verify: see :meth:`stavpr_ros.ros.map_loading.MapLoader.load`.
-        :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
-            old map stays in use.
-        """
+        """Load a map, :meth:`stavpr_ros.ros.map_loading.MapLoader.load`, and publish its route."""
         self._maps.load(path, lock, verify)
         self.worker.call(self._publish_route)
         recognizer = self.pipeline.operation.recognizer
@@ -295,7 +289,7 @@ class Runtime:
             'missing': operation.missing,
             'contrast': operation.contrast,
             'applied_threshold': operation.threshold,
-            'localized': self._publication.localized.is_localized,
+            'localized': self._publication.localized.state.is_localized,
             'sends_transform': self._publication.navigation.sends_transform,
         }
 
