@@ -69,11 +69,7 @@ class Camera:
         return f'camera_info {text} has {fault}: calibrate the camera as it runs'
 
     def require_fitting(self, width: int, height: int) -> None:
-        """
-        Reject intrinsics of images of other proportions.
-
-        :raises InputError: names both sizes.
-        """
+        """Raise InputError if images have other proportions than the intrinsics."""
         if abs(width * self.height / (height * self.width) - 1) > ASPECT + 1 / min(width, height):
             raise InputError(
                 f'the intrinsics are of {self.width}x{self.height} pixels, images have the '

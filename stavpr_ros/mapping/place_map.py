@@ -308,11 +308,7 @@ def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> 
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
-    """
-    Reject a projection that the settings of the features do not name.
-
-    :raises InputError: names both.
-    """
+    """Raise InputError if the settings of the features name another projection."""
     identity = projection.identity if projection else None
     if identity != settings.projection:
         raise InputError(
