@@ -60,11 +60,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _temporary_folder(template: Path | None) -> Path | None:
-    """
-    Return the user's temporary folder of kernels, at first a copy of a filled one; None = none.
-
-    A folder of another user is not taken: numba unpickles the files in it.
-    """
+    """Return the user's temporary folder of kernels, at first a copy of a filled one, or None."""
     try:
         folder = Path(tempfile.gettempdir()) / f'stavpr_kernels_{os.getuid()}'
         if not folder.exists():
@@ -76,6 +72,7 @@ def _temporary_folder(template: Path | None) -> Path | None:
         status = folder.lstat()
     except (OSError, shutil.Error):
         return None
+    # of another user, it is not taken: numba unpickles the files in it
     is_own = status.st_uid == os.getuid() and not status.st_mode & 0o022
     return folder if is_own and not folder.is_symlink() and _is_writable(folder) else None
 

@@ -64,11 +64,7 @@ def open_regular(path: str | Path) -> io.FileIO:
 
 
 def require_regular(path: str | Path) -> None:
-    """
-    Reject a name of anything but a regular file.
-
-    :raises OSError: as :func:`open_regular`.
-    """
+    """Raise OSError, as :func:`open_regular` does, if a name is of no regular file."""
     try:
         if text := elsewhere(path):
             raise ElsewhereError(errno.ENOENT, f'it is {text}')

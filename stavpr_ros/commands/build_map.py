@@ -21,10 +21,8 @@ from stavpr_ros.output_file import MAP, require_replaceable
 if TYPE_CHECKING:
     import numpy as np
     from stavpr_ros.mapping import Map, Trajectory
-    from stavpr_ros.sources.bag import BagSource
-    from stavpr_ros.sources.folder import FolderSource
+    from stavpr_ros.sources import Source
     from stavpr_ros.sources.frame import Frame
-    from stavpr_ros.sources.video import VideoSource
 
 RULES = {  # fields of KeyframeSettings
     'interval': ('S', 'seconds since the last place; for videos and bags'),
@@ -111,13 +109,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar='DEG',
         help='turn 360-degree images to the left; 180: as the robot takes them on its return',
     )
-    _add_keyframe_options(parser)
-    add_job_options(parser)
-    add_feature_options(parser)
-    return parser
-
-
-def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         'keyframes',
         'Only images that differ enough from the last place become places. All rules must be\n'
@@ -127,18 +118,15 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
         group.add_argument(
             f'--keyframe-{name}', type=float, default=0.0, metavar=metavar, help=text
         )
+    add_job_options(parser)
+    add_feature_options(parser)
+    return parser
 
 
 class _Images:
-    """
-    Every N-th image of a source; counts the images that were read.
+    """Every N-th image of a source, turned to the left by a yaw, degrees; counts those read."""
 
-    :param yaw: degrees to the left by which panoramas are turned, 0 = as they are.
-    """
-
-    def __init__(
-        self, source: 'FolderSource | VideoSource | BagSource', every: int, yaw: float = 0.0
-    ) -> None:
+    def __init__(self, source: 'Source', every: int, yaw: float) -> None:
         self.source, self._every, self._yaw = source, every, yaw
         self.read = 0
 
@@ -186,9 +174,7 @@ def _check(arguments: argparse.Namespace) -> None:
     require_replaceable(arguments.output, MAP, arguments.force)
 
 
-def _poses(
-    arguments: argparse.Namespace, source: 'FolderSource | VideoSource | BagSource'
-) -> 'np.ndarray | Trajectory | None':
+def _poses(arguments: argparse.Namespace, source: 'Source') -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.pose_file import read_poses

@@ -103,11 +103,7 @@ def _option(kind: str, name: str) -> str:
 
 
 def _backbone_settings(arguments: argparse.Namespace) -> Any:
-    """
-    Return the settings of the chosen kind from the parsed options, None for ``auto``.
-
-    :raises SettingsError: an option of this kind is missing, or one of another kind was given.
-    """
+    """Return the settings of the chosen kind from the parsed options, None for ``auto``."""
     kind, values = arguments.features, {}
     for other in kinds():
         for row in dataclasses.fields(settings_class(other)):

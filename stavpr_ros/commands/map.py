@@ -151,7 +151,19 @@ def _parser() -> argparse.ArgumentParser:
         'intrinsics of the map',
     )
     add_storage(action, '', halves)
-    _add_routes(add, force)
+    _add_single(add, force)
+    return parser
+
+
+def _add_single(add: Callable[..., argparse.ArgumentParser], force: str) -> None:
+    """Add the actions on one map, its sessions and its versions."""
+    text = 'Write selected sessions of a map to another map.'
+    action = add('sessions', _sessions, text, 'map', 'output', force=force)
+    group = action.add_mutually_exclusive_group(required=True)
+    group.add_argument('--keep', metavar='ID', help='only the places of this session')
+    group.add_argument('--remove', metavar='ID', help="all places except this session's")
+    text = 'Close the map of a round trip: recognition goes on from its end to its start.'
+    add('close', _close, text, 'map', 'output', force=force)
     text = 'Upload a map to the store of a fleet, docs/fleet.md.'
     action = add('upload', _upload, text, 'map', force='replace the map that is there')
     action.add_argument(
@@ -167,23 +179,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar='MAP',
         help="the file to write; by default the recording's, or a numbered name beside it",
     )
-    _add_upkeep(add)
-    return parser
-
-
-def _add_routes(add: Callable[..., argparse.ArgumentParser], force: str) -> None:
-    """Add the actions that write a map of another route."""
-    text = 'Write selected sessions of a map to another map.'
-    action = add('sessions', _sessions, text, 'map', 'output', force=force)
-    group = action.add_mutually_exclusive_group(required=True)
-    group.add_argument('--keep', metavar='ID', help='only the places of this session')
-    group.add_argument('--remove', metavar='ID', help="all places except this session's")
-    text = 'Close the map of a round trip: recognition goes on from its end to its start.'
-    add('close', _close, text, 'map', 'output', force=force)
-
-
-def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the actions on versions of a map."""
     text = 'Update a map by a new drive whose places are certain, docs/upkeep.md.'
     action = add('update', _update, text, 'map')
     action.add_argument(
@@ -430,11 +425,7 @@ def _update(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _drive(arguments: argparse.Namespace, place_map: 'Map') -> 'Iterator[Map]':
-    """
-    Yield the images of a drive, with the features of a map.
-
-    They are in a journal: an interrupted update continues there.
-    """
+    """Yield the images of a drive, with the features of a map; a journal keeps them meanwhile."""
     from stavpr_ros.mapping import is_map, load_map
     from stavpr_ros.mapping.builder import build_journal
     from stavpr_ros.mapping.journal_map import journal_map

@@ -34,15 +34,13 @@ from stavpr_ros.ros.replay import (
     Replayer,
     ReplayOptions,
 )
-from stavpr_ros.sources import open_source
+from stavpr_ros.sources import open_source, Source
 from stavpr_ros.sources.bag import BagSource, ODOMETRY
 from stavpr_ros.sources.bag_messages import list_topics, read_messages
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
-from stavpr_ros.sources.video import VideoSource
 from tqdm import tqdm
 
-Source = FolderSource | VideoSource | BagSource
 NO_SUBSCRIBER, NO_RESULT = 3, 4  # exit codes, besides the ones that all commands have
 FOLDER_FPS = 10.0
 CLOCK_RATE = 40.0  # Hz, as `ros2 bag play`
@@ -78,12 +76,7 @@ exit codes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run the command.
-
-    :param arguments: without the program's name; the process's own if None.
-    :returns: exit code, see ``--help``.
-    """
+    """Run the command."""
     args = list(sys.argv[1:] if arguments is None else arguments)
     codes: dict[type[StavprError], int] = {
         NoSubscriberError: NO_SUBSCRIBER,

@@ -9,7 +9,7 @@ import sys
 import stavpr_ros
 from stavpr_ros import plugins
 from stavpr_ros.commands import Command, COMMANDS
-from stavpr_ros.commands.program import lacking, suggestion, until_unread
+from stavpr_ros.commands.program import run_program, suggestion
 
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
@@ -58,20 +58,9 @@ def forget_requirements() -> None:
 
 
 def main(args: list[str] | None = None) -> int:
-    """
-    Run a command.
-
-    :param args: arguments without the program name; None takes the arguments of the process.
-    :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
-    """
+    """Run a command; return its exit code, 2 for a usage error or a missing ROS installation."""
     forget_requirements()
-    try:
-        return until_unread(lambda: _main(sys.argv[1:] if args is None else args))
-    except ModuleNotFoundError as error:
-        if not (text := lacking(error.name or '')):
-            raise
-        print(f'stavpr: {text}', file=sys.stderr)
-        return 1
+    return run_program('stavpr', lambda: _main(sys.argv[1:] if args is None else args))
 
 
 def _main(arguments: list[str]) -> int:

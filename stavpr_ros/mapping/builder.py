@@ -204,12 +204,7 @@ def _extract(
     progress: bool,
     last: int = -1,
 ) -> Generator[tuple[list[_Place], LocalFeatures], None, None]:
-    """
-    Yield batches of places behind the image of number ``last``, with their features.
-
-    :param thumbnail_width: None = no thumbnails.
-    :raises SettingsError: a rule of motion without poses, or no width of thumbnails.
-    """
+    """Yield batches of places behind the image of number ``last``, with their features."""
     selector = KeyframeSelector(keyframes or KeyframeSettings())
     if selector.settings.needs_poses and poses is None:
         raise SettingsError(

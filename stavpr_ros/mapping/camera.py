@@ -69,11 +69,7 @@ class Camera:
         return f'camera_info {text} has {fault}: calibrate the camera as it runs'
 
     def require_fitting(self, width: int, height: int) -> None:
-        """
-        Reject intrinsics of images of other proportions.
-
-        :raises InputError: names both sizes.
-        """
+        """Raise InputError if images have other proportions than the intrinsics."""
         if abs(width * self.height / (height * self.width) - 1) > ASPECT + 1 / min(width, height):
             raise InputError(
                 f'the intrinsics are of {self.width}x{self.height} pixels, images have the '
@@ -92,11 +88,10 @@ class Camera:
             return np.empty((0, 2))
         scale = np.array([self.width / width, self.height / height])
         full = ((points.astype(np.float64) + 0.5) * scale - 0.5)[:, None]
-        matrix = np.array([[self.focal[0], 0, self.center[0]], [0, self.focal[1], self.center[1]]])
-        matrix = np.vstack([matrix, [0, 0, 1.0]])
         if not any(self.distortion):
             return (full[:, 0] - self.center) / self.focal
-        coefficients = np.array(self.distortion)
+        matrix, coefficients = np.diag([*self.focal, 1.0]), np.array(self.distortion)
+        matrix[:2, 2] = self.center
         if self.model == 'equidistant':
             return np.asarray(cv2.fisheye.undistortPoints(full, matrix, coefficients))[:, 0]
         return np.asarray(cv2.undistortPoints(full, matrix, coefficients))[:, 0]

@@ -40,11 +40,7 @@ def journal_map(path: Path) -> Map:
 
 
 def _read_places(reader: JournalReader, folder: Path) -> Map:
-    """
-    Return the places of a journal, with a temporary file in a folder.
-
-    :raises JournalError: there are none.
-    """
+    """Return the places of a journal, at least one, with a temporary file in a folder."""
     template = reader.template
     row = row_of(template.features)
     W, d = row['strips'].shape
@@ -169,12 +165,7 @@ def _base_map(base: Base) -> tuple[Map | None, str]:
 
 
 def _append(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, ...]) -> Map:
-    """
-    Return a map with the recorded places behind it.
-
-    :param opened: the map when the journal was opened.
-    :param sessions: session of the recorded places, alone; empty = they have none.
-    """
+    """Return a map with the recorded places behind it; opened: the map when they began."""
     growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
     if sessions:
         growing.begin_session(Path(opened.path).stem, sessions[0].id)

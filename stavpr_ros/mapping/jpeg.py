@@ -40,9 +40,3 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
         go_on &= (header[:, 1] != 0xDA) & (header[:, 1] != 0xD9)
         images, at = images[go_on], (at + 2 + length)[go_on]
     return pixels
-
-
-def is_thumbnail(content: bytes) -> bool:
-    """Return whether this is a JPEG of 1 to :data:`MAX_THUMBNAIL_PIXELS` pixels, by its header."""
-    data = np.frombuffer(content, np.uint8)
-    return 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MAX_THUMBNAIL_PIXELS

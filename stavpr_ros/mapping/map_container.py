@@ -151,11 +151,7 @@ class MapFile:
         return digest.hexdigest()
 
     def require_whole(self) -> None:
-        """
-        Reject a file with holes: it claims more than there is.
-
-        :raises MapFileError: names the first hole.
-        """
+        """Raise MapFileError if the file has holes: it claims more than there is."""
         try:
             hole = os.lseek(self._file.fileno(), 0, os.SEEK_HOLE)
         except (AttributeError, OSError):  # unknown to the operating or the file system

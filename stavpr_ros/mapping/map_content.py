@@ -260,11 +260,7 @@ def _thumbnails(file: MapFile, ends: np.ndarray | None) -> Sequence[bytes]:
 
 
 def require_weights(weights: np.ndarray) -> None:
-    """
-    Reject weights that are not between 0 and 1.
-
-    :raises ValueError: they are not.
-    """
+    """Raise ValueError if weights are not between 0 and 1."""
     if weights.size and not (weights.min() >= 0 and weights.max() <= MAX_NORM):
         raise ValueError('part weights is not between 0 and 1')
 

@@ -14,6 +14,7 @@ from typing import Any, get_type_hints
 
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping.place_map import plain_text
 
 SHA256 = re.compile('[0-9a-f]{64}')
 NAME = re.compile('[a-z][a-z0-9_]{0,63}')  # name of a section
@@ -45,7 +46,7 @@ def text(longest: int = 256, pattern: re.Pattern[str] | None = None) -> Check:
     expected = f' like {pattern.pattern}' if pattern else f' of at most {longest} characters'
 
     def is_valid(value: Any) -> bool:
-        is_text = type(value) is str and len(value) <= longest and _is_text(value)
+        is_text = type(value) is str and len(value) <= longest and value == plain_text(value)
         return is_text and (pattern is None or bool(pattern.fullmatch(value)))
 
     return _rule(is_valid, f'a text{expected}')
@@ -105,13 +106,6 @@ def mapping(key: Check, item: Check) -> Check:
 
 def anything(value: Any, where: str) -> None:
     """Take any JSON."""
-
-
-def _is_text(value: str) -> bool:
-    try:
-        return '\0' not in value and value.encode() is not None
-    except UnicodeEncodeError:
-        return False
 
 
 boolean = _rule(lambda value: type(value) is bool, 'true or false')

@@ -70,11 +70,7 @@ def read_header(file: MapFile) -> None:
 
 
 def _id_of(manifest: dict[str, Any], digest: str) -> str:
-    """
-    Return the id of a map, whatever drives on it have shown.
-
-    :param digest: SHA-256 of the manifest.
-    """
+    """Return the id of a map, whatever drives on it have shown; digest: of the manifest."""
     if ERROR_RISKS in manifest['sections']:
         sections = {n: section for n, section in manifest['sections'].items() if n != ERROR_RISKS}
         digest = hashlib.sha256(_json({**manifest, 'sections': sections}).encode()).hexdigest()

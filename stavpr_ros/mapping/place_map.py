@@ -16,7 +16,7 @@ from stavpr_ros.checks import require_at_least, require_shape, require_type, rgb
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.jpeg import is_thumbnail, MAX_THUMBNAIL_PIXELS
+from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.sources import open_source
 from stavpr_ros.units import SECOND
 
@@ -308,11 +308,7 @@ def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> 
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
-    """
-    Reject a projection that the settings of the features do not name.
-
-    :raises InputError: names both.
-    """
+    """Raise InputError if the settings of the features name another projection."""
     identity = projection.identity if projection else None
     if identity != settings.projection:
         raise InputError(
@@ -389,6 +385,12 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
+def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return an image at a width and a height; its pixels are averaged where it is wider."""
+    shrinks = image.shape[1] > size[0]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
 def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     """Return :func:`thumbnail_of` an image as a JPEG."""
     return encode_jpeg(thumbnail_of(image, width), 85)
@@ -402,9 +404,10 @@ def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
 
 def decode_thumbnail(content: bytes) -> np.ndarray | None:
     """Return the image of a thumbnail, RGB (h, w, 3) uint8; None of an empty or damaged one."""
-    if not is_thumbnail(content):
+    data = np.frombuffer(content, np.uint8)
+    if not 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MAX_THUMBNAIL_PIXELS:
         return None
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

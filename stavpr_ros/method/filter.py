@@ -524,11 +524,7 @@ def _step_back(messages, steps, minimum, outside):  # type: ignore[no-untyped-de
 def _forward(  # type: ignore[no-untyped-def]
     states, z, numbers, level, most, steps, change, images
 ):
-    """
-    Return the states (images, V, m) of the latest images, and factors (later, m), L / c.
-
-    :param others: see :func:`smooth`.
-    """
+    """Return the states (images, V, m) of the latest images, and factors (later, m), L / c."""
     (later, m), V = z.shape, len(states)
     forward, likelihoods = np.empty((images, V, m)), np.zeros((later, m))
     if later < images:

@@ -211,11 +211,7 @@ class SequenceRecognizer(ABC):
         require_finite(features, 'the image')
 
     def _match(self, odometry_xy: np.ndarray) -> Match:
-        """
-        Match the window and, where it shows nothing, its newest images.
-
-        :param odometry_xy: of the newest image by odometry, (2,); NaN = unknown.
-        """
+        """Match the window and, where it shows nothing, its newest images; NaN = no odometry."""
         window, run = self._window, None
         self._motion.trajectory.append(odometry_xy)
         fill, shown = len(window.images), WindowMatch()

@@ -205,11 +205,7 @@ class LoopCloser(SequenceRecognizer):
         return replace(match, columns=WindowColumns(first, columns))
 
     def _oldest(self, match: Match) -> list[Match]:
-        """
-        Return the match of the oldest image, if it had none as the middle one and is certain now.
-
-        It is a backward pass over the window. Windows without a match have none of it either.
-        """
+        """Return the match of the oldest image, if it had none as the middle and is certain."""
         if self.window_fill < self._window.length or not match.accepted:
             return []
         self._window.note_match()

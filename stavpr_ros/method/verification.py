@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice, require_shape
 from stavpr_ros.mapping import GrowingMap, Map
+from stavpr_ros.mapping.place_map import resized
 from stavpr_ros.method.match import Match, Status
 
 METHODS = ('orb', 'sift')
@@ -115,10 +116,7 @@ class PlaceVerifier:
         """Return an image at the common width, (h, w) uint8."""
         height, width, _ = require_shape(f'{name}, RGB', image, 'H W 3', 'uint8')
         size = WIDTH, min(max(1, round(height * WIDTH / width)), TALLEST * WIDTH)
-        interpolation = cv2.INTER_AREA if width > WIDTH else cv2.INTER_LINEAR
-        return cv2.resize(
-            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=interpolation
-        )
+        return resized(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size)
 
     def _detect(self, gray: np.ndarray) -> Keypoints:
         nothing = Keypoints(np.empty((0, 2), np.float32), np.empty((0, 0), np.uint8))

@@ -365,11 +365,7 @@ class FilterWindow(QueryWindow):
         return View(path, position, none, -math.inf, 0.0, columns, nothing, np.ones(l))
 
     def _match(self, view: View, images: np.ndarray, number: int) -> WindowMatch:
-        """
-        Return the match of an image.
-
-        :param images: of the window that are matched; number: of the image among these.
-        """
+        """Return the match of the image of a number by images of the window."""
         first, oldest = self.first, self.filter.count - len(view.path)
         numbers, row = images['number'] - oldest, number - oldest
         columns, shares = view.path[numbers], view.shares[numbers]

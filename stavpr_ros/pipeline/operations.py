@@ -120,11 +120,7 @@ class Operation(ABC):
 
     @abstractmethod
     def _update(self, features: LocalFeatures, row: WindowRow) -> tuple[Match, int]:
-        """
-        Match the window that ends with an image, or make the image a place, or both.
-
-        :returns: the match, and the place that the image has become, -1 = none.
-        """
+        """Return the match of the window with an image, and the image's own place, -1 = none."""
 
     @property
     def matched_places(self) -> Map | GrowingMap | None:
@@ -344,11 +340,7 @@ class Operation(ABC):
         return f'images of 16 bits, {images} of {RANGE_IMAGES} for their range' if images else ''
 
     def _check_match(self, match: Match, index: int) -> Match:
-        """
-        Return a match, and its late ones that are matches, after the geometric check.
-
-        :param index: place that the image has become, -1 = none.
-        """
+        """Return a match, and its late ones that are matches, after the geometric check."""
         check, places = self._check, self.matched_places
         if check is None or places is None:
             return match
@@ -609,11 +601,7 @@ def _noise(features: LocalFeatures, count: int) -> LocalFeatures:
 def _warm_up(
     recognizer: SequenceRecognizer, images: LocalFeatures, place_map: Map | None = None
 ) -> None:
-    """
-    Compile and allocate everything, so that the first image is as fast as the others.
-
-    :param images: of a drive; place_map: that they are the first places of, with their poses.
-    """
+    """Compile and allocate everything by images; of a map, by its first places with poses."""
     for i in range(len(images)):
         pose = None if place_map is None else place_map.pose(i)
         recognizer.update(images[i : i + 1], (i + 1) * SECOND // 10, pose)

@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 from stavpr_ros.mapping import GrowingMap, Map
+from stavpr_ros.mapping.place_map import resized
 from stavpr_ros.method import Match
 from stavpr_ros.palette import BLUE, INK, ORANGE, PAPER, rgb, SHADE
 from stavpr_ros.pipeline.result import ImageResult
@@ -65,14 +66,7 @@ def match_image(
         sheet[:height, width + gap :] = _EMPTY
         _write(sheet[:height, width + gap :], 'no place', bar * 0.4, centered=True)
     else:
-        if place.shape[:2] != (height, width):
-            shrinks = place.shape[0] > height
-            place = cv2.resize(
-                place,
-                (width, height),
-                interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
-            )
-        sheet[:height, width + gap :] = place
+        sheet[:height, width + gap :] = resized(place, (width, height))
         _label(sheet[:height, width + gap :], label, bar)
     _label(sheet[:height, :width], 'camera', bar)
     strip = sheet[height:]

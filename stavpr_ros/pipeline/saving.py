@@ -124,26 +124,12 @@ def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -
 def open_journal(
     target: Path, base: Base, template: Map, log: 'Logger | Any'
 ) -> JournalWriter | None:
-    """
-    Open the journal of the first unsaved place; None, and an error in the log, if it fails.
-
-    :param target: file that the map is saved to.
-    :param base: saved places that the recorded ones continue; template: a map of the new place.
-    """
+    """Open the journal of the first unsaved place; None, and an error in the log, if it fails."""
     try:
         return JournalWriter.create(target, base, template, log.error)
     except JournalError as error:
         log.error(f'recorded places are in memory only: {error}')
         return None
-
-
-def close_journals(pipeline: Pipeline, delete_route: bool, log: 'Logger | Any') -> None:
-    """Close the journals of a pipeline that ends; log those with unsaved places."""
-    for path in pipeline.close_journals(delete_route):
-        log.warning(
-            f'unsaved places stay in {path}: the next start of the node makes a map of them, '
-            'or `stavpr map recover`'
-        )
 
 
 def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:

@@ -62,11 +62,7 @@ class PipelineSettings(RecognizerSettings):
         super().__post_init__()
 
     def require_operation(self, operation: str) -> None:
-        """
-        Reject an operation that these settings exclude.
-
-        :raises SettingsError: names the settings.
-        """
+        """Raise SettingsError if these settings exclude an operation."""
         require_choice('operation', operation, OPERATIONS)
         if self.geometric is not None and operation != 'localization' and not self.thumbnail_width:
             raise SettingsError(

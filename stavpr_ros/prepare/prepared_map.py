@@ -95,11 +95,7 @@ def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
 
 
 def _of_codes(features: StoredFeatures) -> LocalFeatures:
-    """
-    Return the features that are kept as codes in the map's file.
-
-    :raises MapFileError: they are longer than codes can be.
-    """
+    """Return the features that are kept as codes in the map's file."""
     W, n = features.weights.shape
     strips: Any = Int8Strips(W, n, features.dimension)
     with errors_of(features.file.path):
@@ -149,11 +145,7 @@ def statistics_of_map(place_map: Map, storage: str = '') -> MapStatistics | None
 
 
 class _AsStored(LocalFeatures):
-    """
-    Features, read a block at a time, as they will be in a file.
-
-    :param storage: see :func:`stavpr_ros.mapping.save_map`.
-    """
+    """Features, read a block at a time, as they will be in a file of a storage."""
 
     def __init__(self, features: LocalFeatures, storage: str) -> None:
         for name in ('weights', 'settings', 'cells'):

@@ -230,12 +230,7 @@ class RouteFeatures:
         self.latest = self.strips[:, last].copy()
 
     def _shift(self, first: int, change: np.ndarray) -> None:
-        """
-        Add to features, and make them unit norm again; zero features stay zero.
-
-        :param first: place from which on; it becomes place 0, the last one the last of ``count``.
-        :param change: shape (W, 1, d).
-        """
+        """Add to the features of places from ``first`` on, which becomes place 0."""
         for low in range(0, self.count, AT_ONCE):
             places = slice(low, min(low + AT_ONCE, self.count))
             source = slice(places.start + first, places.stop + first)
@@ -246,11 +241,7 @@ class RouteFeatures:
 def _shift_means(
     strips: np.ndarray, norms: np.ndarray, change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Add to features (W, m, d) of norms (W, m), and make them unit norm; zero features stay zero.
-
-    :returns: the features, and their norms.
-    """
+    """Add to features (W, m, d) of norms (W, m) that are not zero; return unit ones and norms."""
     alive = norms[..., None] > 0
     moved = strips * norms[..., None]
     moved += change

@@ -104,7 +104,10 @@ class Observations:
         both = weight[:, None] * np.einsum('mij,mi->mj', by_motion, by_depth)
         np.add.at(shared, (self.neighbor, self.keypoint), both)
         coupling = shared.transpose(0, 2, 1).reshape(6 * count, keypoints)
-        normal, right = information.copy(), information @ _motion_difference(motions, prior)
+        rotations = motions[:, :3, :3] @ prior[:, :3, :3].transpose(0, 2, 1)
+        turns = [cv2.Rodrigues(rotation)[0].ravel() for rotation in rotations]
+        since = np.column_stack([motions[:, :3, 3] - prior[:, :3, 3], turns])  # (n, 6)
+        normal, right = information.copy(), information @ since.ravel()
         for number in range(count):
             is_own, part = self.neighbor == number, slice(6 * number, 6 * number + 6)
             rows, weights = by_motion[is_own].reshape(-1, 6), np.repeat(weight[is_own], 2)
@@ -119,13 +122,6 @@ class Observations:
             motion[:3, 3] += change[:3]
             motion[:3, :3] = cv2.Rodrigues(change[3:])[0] @ motion[:3, :3]
         return result, np.maximum(deeper, MIN_INVERSE_DEPTH)
-
-
-def _motion_difference(motions: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Return translations and rotations from the prior to motions, one after the other, (6n,)."""
-    rotations = motions[:, :3, :3] @ prior[:, :3, :3].transpose(0, 2, 1)
-    turns = [cv2.Rodrigues(rotation)[0].ravel() for rotation in rotations]
-    return np.column_stack([motions[:, :3, 3] - prior[:, :3, 3], turns]).ravel()
 
 
 def odometry_information(motions: np.ndarray, before: int) -> np.ndarray:

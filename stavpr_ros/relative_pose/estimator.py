@@ -111,11 +111,7 @@ class EdgeEstimator:
         return replace(edge, reason=reason, pose=turn_pose(edge.pose, pair.relative_yaw))
 
     def _pnp(self, pair: MatchedPair, query_camera: Camera, place_camera: Camera) -> Edge:
-        """
-        Return the edge by PnP, or one that it refutes.
-
-        :raises InputError: the images or their surroundings do not permit PnP.
-        """
+        """Return the edge by PnP, or one that it refutes; InputError where it is impossible."""
         query, landmarks, reach = self._query_and_landmarks(pair, query_camera, place_camera)
         result = solve_pnp(query, landmarks)
         if result.matrix is None:
@@ -133,11 +129,7 @@ class EdgeEstimator:
     def _query_and_landmarks(
         self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
     ) -> tuple[View, list[Landmarks], float]:
-        """
-        Return the query, landmarks in the frame of the place, and how far they serve (m).
-
-        :raises InputError: the intrinsics are of another size, or the place has no neighbors.
-        """
+        """Return the query, landmarks in the frame of the place, and how far they serve (m)."""
         assert pair.query is not None
         source = self._source
         if source is None or source[0] is not pair.source or source[1] != place_camera:
@@ -150,17 +142,13 @@ class EdgeEstimator:
             if abs(index - pair.place) <= LANDMARK_RADIUS:
                 beside, _, _ = self._landmarks_of(pair, index, place_camera)
                 landmarks.append(beside.transform(inverse(motion)))
-        return self._view(pair.query, query_camera), landmarks, reach
+        return view_of(pair.query, query_camera), landmarks, reach
 
     def _landmarks_of(
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
         make = partial(self._triangulate, pair, place, camera)
         return _get_or_make(self._landmarks, place, LANDMARKS, make)
-
-    def _view(self, image: np.ndarray, camera: Camera) -> View:
-        camera.require_fitting(image.shape[1], image.shape[0])
-        return view_of(image, camera)
 
     def _triangulate(
         self, pair: MatchedPair, place: int, camera: Camera
@@ -191,7 +179,7 @@ class EdgeEstimator:
 
         def make() -> View | None:
             image = decode_thumbnail(pair.thumbnails[index])
-            return None if image is None else self._view(image, camera)
+            return None if image is None else view_of(image, camera)
 
         return _get_or_make(self._views, index, VIEWS, make)
 

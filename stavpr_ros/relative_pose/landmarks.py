@@ -64,12 +64,14 @@ def view_of(image: np.ndarray, camera: Camera) -> View:
     Detect the keypoints of a thumbnail.
 
     :param image: RGB, uint8, shape (h, w, 3).
+    :raises InputError: of other proportions than the camera's.
     """
+    height, width = image.shape[:2]
+    camera.require_fitting(width, height)
     library: Any = cv2  # its types leave SIFT out
     detector = library.SIFT_create(FEATURES, contrastThreshold=CONTRAST)
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = detector.detectAndCompute(gray, None)
-    height, width = gray.shape
     focal = camera.focal[0] * width / camera.width
     if descriptors is None:
         return View(np.empty((0, 2)), np.empty((0, 128), np.float32), focal)

@@ -41,7 +41,11 @@ def align(pair: MatchedPair) -> Edge:
     offsets = np.arange(-MAX_OFFSET, MAX_OFFSET + STEP, STEP) * pair.spacing
     start = float(track[pair.place - pair.first])
     total = np.zeros(len(offsets))
-    rows = np.array([_finite(pair.distances[image, spaced]) for image in images])
+    rows = pair.distances[np.ix_(images, spaced)]
+    compared = np.where(np.isfinite(rows), rows, -np.inf)
+    # places that are not compared are as far as the farthest
+    rows = np.where(np.isfinite(rows), rows, compared.max(axis=1, keepdims=True))
+    rows = np.nan_to_num(rows, neginf=0)  # an image that is compared with none
     # smooth: between places, linear interpolation would pull all images to the same side
     grid = np.arange(track[spaced[0]], track[spaced[-1]], STEP * pair.spacing)
     smooth = CubicSpline(track[spaced], rows.T)(grid)
@@ -56,13 +60,6 @@ def align(pair: MatchedPair) -> Edge:
     covariance = np.diag([ACROSS**2] * 3 + [TURN**2] * 3)
     covariance[:3, :3] += (along**2 - ACROSS**2) * np.outer(direction, direction)
     return Edge(Source.ALIGNED, '', pose, covariance)
-
-
-def _finite(row: np.ndarray) -> np.ndarray:
-    """Return distances (k,); places that are not compared are as far as the farthest."""
-    is_compared = np.isfinite(row)
-    farthest = float(row[is_compared].max()) if is_compared.any() else 0.0
-    return np.where(is_compared, row, farthest)
 
 
 def _find_minimum(offsets: np.ndarray, total: np.ndarray) -> float:

@@ -22,29 +22,22 @@ LOSS_PERIOD = 60.0  # seconds between two warnings of lost images in the log
 Value = str | int | float | None
 
 
-class DiagnosticsPublisher:
+def publish_diagnostics(node: Node, period: float, state: Callable[[], Health]) -> Beat:
     """
-    Publishes on ``/diagnostics`` from a thread.
+    Publish on ``/diagnostics`` from a thread, which is returned.
 
     :param period: seconds.
-    :param health: returns the state of the node; called from the thread.
+    :param state: returns the state of the node; called from the thread.
     """
+    publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
-    def __init__(self, node: Node, period: float, health: Callable[[], Health]) -> None:
-        self._node, self._health = node, health
-        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._beat = Beat(node, period, self._report, 'diagnostics')
-
-    def stop(self) -> None:
-        """End the thread."""
-        self._beat.stop()
-
-    def _report(self) -> None:
-        stamp = self._node.get_clock().now().to_msg()
-        name, health = self._node.get_fully_qualified_name(), self._health()
-        self._publisher.publish(diagnostic_array(health, name, stamp))
+    def report() -> None:
+        stamp, health = node.get_clock().now().to_msg(), state()
+        publisher.publish(diagnostic_array(health, node.get_fully_qualified_name(), stamp))
         if text := loss(health):
-            self._node.get_logger().warning(text, throttle_duration_sec=LOSS_PERIOD)
+            node.get_logger().warning(text, throttle_duration_sec=LOSS_PERIOD)
+
+    return Beat(node, period, report, 'diagnostics')
 
 
 def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:

@@ -88,11 +88,7 @@ class EdgePublisher:
     def _immediate(
         self, pair: MatchedPair | None, query_camera: Camera | None, place_camera: Camera | None
     ) -> Edge:
-        """
-        Return the edge of a match, which waits for nothing: by odometry, or without a pose.
-
-        :param pair: None = the place of a map can have no edge.
-        """
+        """Return the edge of a match, which waits for nothing: by odometry, or without a pose."""
         if self._estimator.method == 'none':
             return Edge(Source.NONE, 'parameter relative_pose is none')
         if pair is None:

@@ -84,10 +84,13 @@ def findings(health: Health, node: str) -> dict[str, list[Finding]]:
     normal = f'{images.rate:.1f} images per second on {topic}'
     if images.age is None:
         normal = f'waiting for the first image on {topic}'
+    recognition = [_recognition_finding(health)]
+    if health.sends_transform and not health.localized:
+        recognition.append((WARN, 'not localized: the transform on /tf is of the last match'))
     return {
         'input': [*_silence(health), *_image_faults(health)] or [(OK, normal)],
         'map': of_map,
-        'recognition': [_recognition_finding(health), *_transform_finding(health)],
+        'recognition': recognition,
         'processing': [_processing_finding(health), *_edge_faults(health)],
     }
 
@@ -204,12 +207,6 @@ def _recognition_finding(health: Health) -> Finding:
         reason = f' ({counts.reason})' if counts.reason else ''
         text += f'; last result: {counts.status}{place}{distance}{reason}'
     return OK, text
-
-
-def _transform_finding(health: Health) -> Iterator[Finding]:
-    """Yield that the transform for navigation cannot be trusted."""
-    if health.sends_transform and not health.localized:
-        yield WARN, 'not localized: the transform on /tf is of the last match'
 
 
 def _why_no_match_is_possible(health: Health) -> str:

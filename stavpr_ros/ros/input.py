@@ -142,7 +142,9 @@ class ImageInput:
         self._subscription.close()
 
     def _on_refused(self, policy: str) -> None:
-        self.remedy = qos_remedy(self.topic, policy)
+        remedy = _REMEDIES.get(policy, f'make the publisher offer at least the requested {policy}')
+        offer = f'a publisher of {self.topic} offers another {policy.lower()}'
+        self.remedy = f'{offer}: {remedy.format(topic=self.topic)}'
         self._node.get_logger().error(f'images are not received: {self.remedy}')
 
     def _on_lost(self, count: int) -> None:
@@ -203,12 +205,6 @@ class ImageInput:
             )
         self._last = now
         return ''
-
-
-def qos_remedy(topic: str, policy: str) -> str:
-    """Return the remedy for a publisher with an incompatible quality of service."""
-    remedy = _REMEDIES.get(policy, f'make the publisher offer at least the requested {policy}')
-    return f'a publisher of {topic} offers another {policy.lower()}: ' + remedy.format(topic=topic)
 
 
 def subscribe(

@@ -76,22 +76,17 @@ class Localization:
 
 
 class LocalizedPublisher(Publishers):
-    """Publishes ``~/localized`` and ``~/current_node`` when they change."""
+    """Publishes ``~/localized``, of its ``state``, and ``~/current_node`` when they change."""
 
     def __init__(self, node: Node, settings: NodeSettings) -> None:
         super().__init__(node)
-        self._state = Localization(settings)
+        self.state = Localization(settings)
         self._localized = self._make(Bool, '~/localized', LATCHED)
         self._current_node = self._make(String, '~/current_node', LATCHED)
         self._places: Places = None
         self._route: tuple[np.ndarray, int] = np.arange(0), 0
         self._published: tuple[bool | None, str] = (None, '')
         self._publish(NOWHERE)
-
-    @property
-    def is_localized(self) -> bool:
-        """Whether the robot is localized."""
-        return self._state.is_localized
 
     def publish(self, outcome: Outcome) -> None:
         """Publish what an image has changed; a robot is localized on a map, not on a route."""
@@ -107,15 +102,15 @@ class LocalizedPublisher(Publishers):
         position = None if pose is None else pose[:3]
         positions, lap = self._route
         along = int(positions[match.newest]) if match.accepted else -1
-        self._state.update(along, match.probability, position, lap)
-        if not self.is_localized:
+        self.state.update(along, match.probability, position, lap)
+        if not self.state.is_localized:
             self._publish(NOWHERE)
         elif outcome.newest is not None:
             self._publish(outcome.newest.identifier or str(match.newest))
 
     def reset(self) -> None:
         """Be not localized: another map, or the window was emptied."""
-        self._state.reset()
+        self.state.reset()
         self._places = None
         self._publish(NOWHERE)
 
@@ -125,8 +120,9 @@ class LocalizedPublisher(Publishers):
         super().close()
 
     def _publish(self, current_node: str) -> None:
-        last, self._published = self._published, (self.is_localized, current_node)
-        if last[0] is not self.is_localized:
-            self._send(self._localized, Bool(data=self.is_localized))
+        is_localized = self.state.is_localized
+        last, self._published = self._published, (is_localized, current_node)
+        if last[0] is not is_localized:
+            self._send(self._localized, Bool(data=is_localized))
         if last[1] != current_node:
             self._send(self._current_node, String(data=current_node))

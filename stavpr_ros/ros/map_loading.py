@@ -53,7 +53,7 @@ class MapLoader:
         self, path: str, lock: AbstractContextManager[object] | None = None, verify: bool = False
     ) -> None:
         """
-        Load a map and use it.
+        Load a map and use it; meanwhile, and after an error, the old one stays in use.
 
         :param lock: acquired to put the map into use, not to read its file.
         :param verify: compare its hashes first; otherwise a thread does so while it is in use.

@@ -134,12 +134,7 @@ class Navigation(Publishers):
 
 
 def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:
-    """
-    Return the pose of the odometry's frame in the map.
-
-    :param place: pose of the robot in the map, x y z and quaternion x y z w, shape (7,).
-    :param odometry: pose of the robot in the odometry's frame, shape (7,).
-    """
+    """Return the pose of the odometry's frame in the map, by those of the robot in both, (7,)."""
     return to_poses(matrices(place) @ inverse(matrices(odometry)))
 
 

@@ -24,7 +24,7 @@ from stavpr_ros.memory import give_back
 from stavpr_ros.parameters import BY_NAME, RENAMED
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
+from stavpr_ros.ros.diagnostics import publish_diagnostics
 from stavpr_ros.ros.health import Health, INVALID
 from stavpr_ros.ros.parameters import (
     convert_type,
@@ -84,9 +84,8 @@ class PlaceRecognitionNode(ManagedNode):
         self._jumps = self.get_clock().create_jump_callback(
             backwards, post_callback=self._on_clock_jump
         )
-        self._diagnostics = DiagnosticsPublisher(
-            self, self.settings.diagnostics_period, self._health
-        )
+        period = self.settings.diagnostics_period
+        self._diagnostics = publish_diagnostics(self, period, self._health)
         self._start: Timer | None = None
         if self.settings.autostart:
             group = MutuallyExclusiveCallbackGroup()
@@ -242,21 +241,11 @@ class PlaceRecognitionNode(ManagedNode):
             return self._reject(error)
 
     def load_map(self, path: str, verify: bool = False) -> None:
-        """
-        Load a map and use it.
-
-        :param verify: compare its hashes before it is used, not later.
-        :raises StavprError: the node is not configured, or the map is invalid; the old one stays
-            in use.
-        """
+        """Load a map and use it, :meth:`stavpr_ros.ros.map_loading.MapLoader.load`."""
         self.runtime.load(path, self._lock, verify)
 
     def set_operation(self, operation: str) -> None:
-        """
-        Change the operation.
-
-        :raises StavprError: the node is not configured, or the operation cannot be changed.
-        """
+        """Change the operation, :meth:`stavpr_ros.ros.runtime.Runtime.change`."""
         with self._lock:
             runtime, settings = self.runtime, self._settings_with({'operation': operation})
             runtime.change(settings)
@@ -273,11 +262,17 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _validate_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Check all parameters together; change nothing."""
-        changes = {row.name: row.value for row in parameters if row.name in BY_NAME}
+        values = {row.name: row.value for row in parameters if row.name in BY_NAME}
+        if not values:
+            return SetParametersResult(successful=True)
         try:
-            if changes:
-                with self._lock:
-                    self._require_valid(changes)
+            with self._lock:
+                changes = {n: v for n, v in values.items() if v != self.get_parameter(n).value}
+                if self._runtime is not None:
+                    require_changeable(changes, self.state)
+                settings = self._settings_with(changes)
+                if settings.save_path != self.settings.save_path:
+                    require_writable(settings.save_path)
         except StavprError as error:
             return self._reject(error)
         return SetParametersResult(successful=True)
@@ -285,15 +280,6 @@ class PlaceRecognitionNode(ManagedNode):
     def _reject(self, error: StavprError) -> SetParametersResult:
         self.get_logger().error(f'parameters rejected: {error}')
         return SetParametersResult(successful=False, reason=str(error))
-
-    def _require_valid(self, values: dict[str, Any]) -> None:
-        current = {name: self.get_parameter(name).value for name in values}
-        changes = {name: value for name, value in values.items() if value != current[name]}
-        if self._runtime is not None:
-            require_changeable(changes, self.state)
-        settings = self._settings_with(changes)
-        if settings.save_path != self.settings.save_path:
-            require_writable(settings.save_path)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         """Apply validated parameters; try to start again where the last try failed."""
@@ -346,11 +332,7 @@ class PlaceRecognitionNode(ManagedNode):
         )
 
     def _publish_map_info(self, state: str = '', path: str = '') -> None:
-        """
-        Publish the description of the map, if any, where it has changed.
-
-        :param state: of a node that is not configured, '' = of the map in use; path: of its file.
-        """
+        """Publish the description of the map where it has changed; by a state, of none in use."""
         with self._info_lock:  # in the order of the changes
             if state:
                 operation, robot_id = self.settings.operation, self.settings.robot_id

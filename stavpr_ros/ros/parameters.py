@@ -177,12 +177,7 @@ def inside_maps_folder(parameter: Parameter, node: ManagedNode, folder: Path) ->
 
 
 def require_writable(save_path: str) -> None:
-    """
-    Reject a file that cannot be written, before a recorded map would be lost.
-
-    :param save_path: '' = no file.
-    :raises SettingsError: names the parameter.
-    """
+    """Raise SettingsError if a file, '' = none, cannot be written: a map would be lost."""
     try:
         if save_path:
             require_room(save_path)

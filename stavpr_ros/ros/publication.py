@@ -23,9 +23,7 @@ class Publication:
     """
     Publishes the outcome of each image, ``~/match`` last; loop closures when they are ready.
 
-    :param operation: returns the operation.
-    :param on_subscriber: called on another thread when the route has a new subscriber; it calls
-        :meth:`publish_route` on the worker.
+    :param operation, on_subscriber: see :class:`stavpr_ros.ros.visualization.Visualization`.
     """
 
     def __init__(

@@ -17,7 +17,6 @@ from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
-    close_journals,
     open_journal,
     recover_maps,
     save_recorded_map,
@@ -174,8 +173,11 @@ class Runtime:
                 self._node.left_behind = True
             self._maps.stop()
             if self._pipeline is not None:
-                delete_route = not self.settings.save_path
-                close_journals(self._pipeline, delete_route, self._node.get_logger())
+                for path in self._pipeline.close_journals(not self.settings.save_path):
+                    self._node.get_logger().warning(
+                        f'unsaved places stay in {path}: the next start of the node makes a map '
+                        'of them, or `stavpr map recover`'
+                    )
             self._end_bond()
             self._publication.close()
 
@@ -220,13 +222,7 @@ class Runtime:
     def load(
         self, path: str, lock: AbstractContextManager[Any] | None = None, verify: bool = False
     ) -> None:
-        """
-        Load a map and use it; meanwhile the old one stays in use.
-
-        :param lock, verify: see :meth:`stavpr_ros.ros.map_loading.MapLoader.load`.
-        :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
-            old map stays in use.
-        """
+        """Load a map, :meth:`stavpr_ros.ros.map_loading.MapLoader.load`, and publish its route."""
         self._maps.load(path, lock, verify)
         self.worker.call(self._publish_route)
         recognizer = self.pipeline.operation.recognizer
@@ -293,7 +289,7 @@ class Runtime:
             'missing': operation.missing,
             'contrast': operation.contrast,
             'applied_threshold': operation.threshold,
-            'localized': self._publication.localized.is_localized,
+            'localized': self._publication.localized.state.is_localized,
             'sends_transform': self._publication.navigation.sends_transform,
         }
 
@@ -316,11 +312,9 @@ class Runtime:
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
         self._statistics.add_drop(cause)
-        result, robot_id = (
-            self.pipeline.operation.unmatched(status, reason),
-            self.settings.robot_id,
-        )
-        outcome = Outcome(message.header, result, self.pipeline.places, robot_id=robot_id)
+        pipeline, robot_id = self.pipeline, self.settings.robot_id
+        result = pipeline.operation.unmatched(status, reason)
+        outcome = Outcome(message.header, result, pipeline.places, robot_id=robot_id)
         self._publication.output.publish(outcome)
 
     def _process(self, item: _Item) -> None:

@@ -55,9 +55,29 @@ class OdometryInput:
         return 'fresh' if time.monotonic() - self._arrived < max(2.0, self._timeout) else 'stale'
 
     def fault(self) -> str:
-        """Return why nothing can arrive, as a wrong remapping; empty = nothing known."""
-        fresh = self.freshness() == 'fresh'
-        return '' if fresh else find_misdirection(self._node, self._subscription.topic_name)
+        """
+        Return why nothing can arrive, as a wrong remapping; empty = nothing known.
+
+        Odometry beside a topic ``map_to_odom`` is from a pose graph: its corrections, made from
+        the loop closures, must not come back as odometry.
+        """
+        node, topic = self._node, self._subscription.topic_name
+        types = sorted({info.topic_type for info in node.get_publishers_info_by_topic(topic)})
+        if self.freshness() == 'fresh' or ODOMETRY in types:
+            return ''
+        topics_text = f'{", ".join(types)} is published' if types else 'nothing is published'
+        topics = dict(node.get_topic_names_and_types())
+        others = [
+            name
+            for name, kinds in topics.items()
+            if ODOMETRY in kinds
+            and node.count_publishers(name)
+            and f'{name.rpartition("/")[0]}/map_to_odom' not in topics
+        ]
+        if not (types or others):
+            return ''
+        hint = f', odometry is on {", ".join(others)}' if others else ''
+        return f'{topics_text} on {topic}{hint}: remap odom to the topic of the odometry'
 
     def oddities(self) -> list[str]:
         """Return what is odd about the last poses, for the diagnostics."""
@@ -82,34 +102,6 @@ class OdometryInput:
         self._last.append((stamp, pose))
         self._arrived = time.monotonic()
         self.frame, self.child_frame = message.header.frame_id, message.child_frame_id
-
-
-def find_misdirection(node: Node, topic: str) -> str:
-    """
-    Return why no odometry can arrive on a topic; empty if it can, or if there is none anywhere.
-
-    Odometry beside a topic ``map_to_odom`` is from a pose graph: its corrections, made from the
-    loop closures, must not come back as odometry.
-
-    :param topic: after remapping.
-    """
-    publishers = node.get_publishers_info_by_topic(topic)
-    types = sorted({info.topic_type for info in publishers})
-    if ODOMETRY in types:
-        return ''
-    topics_text = f'{", ".join(types)} is published' if types else 'nothing is published'
-    topics = dict(node.get_topic_names_and_types())
-    others = [
-        name
-        for name, kinds in topics.items()
-        if ODOMETRY in kinds
-        and node.count_publishers(name)
-        and f'{name.rpartition("/")[0]}/map_to_odom' not in topics
-    ]
-    if not (types or others):
-        return ''
-    hint = f', odometry is on {", ".join(others)}' if others else ''
-    return f'{topics_text} on {topic}{hint}: remap odom to the topic of the odometry'
 
 
 class CameraInput:

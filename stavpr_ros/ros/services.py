@@ -68,11 +68,7 @@ class Services:
     def _callback(
         self, name: str, serve: Callable[[Runtime, Any, Any], str]
     ) -> Callable[[Any, Any], Any]:
-        """
-        Return a service callback that fills ``success`` and ``message``.
-
-        An error that is repeated, as by a client that polls, is logged once.
-        """
+        """Return a callback that fills ``success`` and ``message``; logs a repeated error once."""
 
         def callback(request: Any, response: Any) -> Any:
             try:

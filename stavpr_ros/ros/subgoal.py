@@ -4,14 +4,13 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage
 from stavpr_msgs.msg import PlaceCandidates
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import Map
-from stavpr_ros.mapping.place_map import encode_jpeg
+from stavpr_ros.mapping.place_map import encode_jpeg, resized
 from stavpr_ros.method import Candidate
 from stavpr_ros.pipeline import ImageResult, NodeSettings
 from stavpr_ros.ros.messages import candidates_message, Outcome
@@ -85,6 +84,4 @@ def thumbnail_of_width(places: Map, index: int, width: int) -> bytes:
     if image is None or image.shape[1] == width:
         return content
     size = width, max(1, round(width * image.shape[0] / image.shape[1]))
-    shrinks = width < image.shape[1]
-    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return encode_jpeg(image, QUALITY)
+    return encode_jpeg(resized(image, size), QUALITY)

@@ -136,12 +136,7 @@ class Visualization(Publishers):
             self._send(self._distances, image_message(outcome.header, columns[None], '32FC2'))
 
     def _note(self, outcome: Outcome) -> None:
-        """
-        Keep the pose of the matched place, and the line from the query to it.
-
-        On a map, the query is where the odometry leads to from the last match: a long line is a
-        jump.
-        """
+        """Keep the pose of the matched place, and the line from the query to it."""
         match, places, odometry = outcome.match, outcome.places, outcome.about.pose
         if places is None or outcome.newest is None or (pose := outcome.newest.pose) is None:
             return
@@ -150,7 +145,7 @@ class Visualization(Publishers):
         query = None
         if match.first_image >= 0:
             query = places.place(outcome.result.image_index).pose
-        elif odometry is not None:
+        elif odometry is not None:  # where it leads to from the last match: a long line is a jump
             if self._correction is not None:
                 query = to_poses(self._correction @ matrices(odometry))
             self._correction = matrices(pose) @ inverse(matrices(odometry))

@@ -4,7 +4,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from stavpr_ros.checks import require_type
 from stavpr_ros.errors import ImageError, SourceError
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.video import VideoSource
 
+Source: TypeAlias = 'FolderSource | VideoSource | BagSource'
+
 
 def open_source(
     path: str | Path,
@@ -22,7 +24,7 @@ def open_source(
     on_error: Callable[[ImageError], None] | None = None,
     fps: float | None = None,
     camera: str | None = None,
-) -> 'FolderSource | VideoSource | BagSource':
+) -> Source:
     """
     Open a folder of images, a video or a bag, whichever it is.
 

@@ -4,16 +4,10 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources import open_source
-
-if TYPE_CHECKING:
-    from stavpr_ros.sources.bag import BagSource
-    from stavpr_ros.sources.folder import FolderSource
-    from stavpr_ros.sources.video import VideoSource
+from stavpr_ros.sources import open_source, Source
 
 
 class Image(np.ndarray):
@@ -32,7 +26,7 @@ class Image(np.ndarray):
 class Images:
     """The images of a source, an :class:`Image` each; every iteration reads them again."""
 
-    def __init__(self, source: 'FolderSource | VideoSource | BagSource') -> None:
+    def __init__(self, source: Source) -> None:
         self.source = source
 
     def __len__(self) -> int:

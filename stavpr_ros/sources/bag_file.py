@@ -196,12 +196,8 @@ def _note_missing(
 
 
 def _open_file(file: Path, stack: ExitStack) -> Any:
-    """
-    Return an open reader of one file, which the stack closes, with a temporary copy if needed.
-
-    rosbags opens databases as immutable: it writes nothing, but ignores the logs of SQLite; and it
-    does not quote file names.
-    """
+    """Return an open reader of one file, which the stack closes, or of a temporary copy."""
+    # rosbags opens databases as immutable, without the logs of SQLite, and quotes no file names
     source, kind = file, storage_kind(file)
     logs = [Path(f'{file}{end}') for end in LOG_SUFFIXES]
     logs = [log for log in logs if log.exists() and log.stat().st_size]

@@ -117,12 +117,7 @@ def _is_stamped(group: dict[Path, tuple[int, ...]]) -> bool:
 
 
 def _parallel(groups: Groups, count: int, common: float) -> Groups:
-    """
-    Return the groups whose times are among another group's, or whose counters are equal.
-
-    :param count: images of the folder.
-    :param common: smallest share of the counters of the larger group.
-    """
+    """Return the groups whose times, or a common share of their counters, are another group's."""
     min_images = max(2, MIN_SHARE * count)
     large = {name: group for name, group in groups.items() if len(group) >= min_images}
     several: Groups = {}

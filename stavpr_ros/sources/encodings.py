@@ -215,12 +215,7 @@ def _decode_raw(
 def _decode_compressed(
     message: Any, min_size: tuple[int, int] | None, to_bytes: files.ToBytes | None
 ) -> np.ndarray:
-    """
-    Decode a ``sensor_msgs/CompressedImage``; the bytes decide the file format.
-
-    The message's ``format`` is needed twice: to reject depth images, and to detect Bayer mosaics,
-    which image_transport stores as gray files.
-    """
+    """Decode a CompressedImage: the bytes decide; ``format`` names depth images and mosaics."""
     original = message.format.partition(';')[0].strip()
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
         raise ImageError(
@@ -235,13 +230,9 @@ def _decode_compressed(
 
 
 def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
-    """
-    Find the Bayer mosaic in a format such as ``bayer_rggb8; png compressed``.
-
-    After ``keyword`` follows the encoding before compression: nothing or the same mosaic if it
-    was not converted, ``mono8`` or ``bgr8`` if it is no mosaic any more.
-    """
+    """Find the Bayer mosaic in a format such as ``bayer_rggb8; png compressed``."""
     original, _, rest = transport.partition(';')
+    # target: nothing or the same mosaic, unless it was converted before compression
     _, keyword, target = rest.partition('compressed')
     layout = ENCODINGS.get(original.strip()) if original.startswith('bayer_') else None
     if layout is None or not keyword or target.strip() not in {'', original.strip()}:

@@ -55,11 +55,7 @@ def is_video(path: str | Path) -> bool:
 
 
 def require_video(fps: float | None, paths: Iterable[str | None]) -> None:
-    """
-    Reject the option ``--fps`` where no input is a video.
-
-    :raises SettingsError: it is given, and none is.
-    """
+    """Raise SettingsError if the option ``--fps`` is given, and no input is a video."""
     if fps is not None and not any(path is not None and is_video(path) for path in paths):
         raise SettingsError(f'--fps {fps:g}: no input is a video (.mp4, .mov ...); leave it out')
 
