@@ -84,8 +84,12 @@ def ours(edges: list[Edge]) -> Result:
     return solved[:, :3, 3], np.array([edge.accepted for edge in graph.edges]), []
 
 
-def one_at_a_time(edges: list[Edge]) -> Result:
-    """Return the same where closures come with the later one of their nodes, each an update."""
+def one_at_a_time(edges: list[Edge], timed: int | None = None) -> Result:
+    """
+    Return the same where closures come with the later one of their nodes, each an update.
+
+    :param timed: only the last so many do, the others at once.
+    """
     given = graph_of(edges)
     with patch.object(g2o, 'PoseGraph') as made:
         graph_of(edges)
@@ -102,16 +106,19 @@ def one_at_a_time(edges: list[Edge]) -> Result:
 
     at = np.array([max(each.query_stamp, each.place_stamp) for each in closures])
     order = np.argsort(at, kind='stable')
-    for number in order:
+    first = len(order) if timed is None else timed
+    for waiting, number in zip(range(len(order) - 1, -1, -1), order, strict=True):
         advance(at[number])
         graph.add_closure(closures[number])
+        if waiting > first:
+            continue
         began = time.process_time()
         graph.update()
         times.append((time.process_time() - began) * 1e3)
     advance(given.chain.stamps[-1])
     solved, accepted = graph.update(final=True), np.zeros(len(order), bool)
     accepted[order] = [edge.accepted for edge in graph.edges]
-    return solved[:, :3, 3], accepted, times
+    return solved[:, :3, 3], accepted, times if timed is None else times[1:]
 
 
 def consistent(edges: list[Edge]) -> np.ndarray:

@@ -4,14 +4,20 @@
 Update time of a large pose graph: laps on a circle, a closure at 85 % of the keyframes.
 
 Before the timed updates the graph grows in larger steps; the timed ones add one keyframe each.
+With ``--plot``, also of city-like graphs (``graph_city.py``), 30 % of whose closures are false.
 """
 
 import argparse
+from itertools import product
+from pathlib import Path
 import time
 
+from graph_city import city
+from graph_files import false_closures, one_at_a_time
 import numpy as np
 from results import commit, cpu_model
 from stavpr_lab.demonstration.simulated_odometry import add_drift
+from stavpr_lab.style import DASHES, legend_above, page
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure, PoseGraph
@@ -55,6 +61,30 @@ def measure(nodes: int, timed: int, drift: float, late: int) -> tuple[np.ndarray
     return np.array(times), graph
 
 
+def measure_city(nodes: int, timed: int) -> tuple[np.ndarray, int]:
+    """Return the processor time of each of the last updates, ms, and the accepted closures."""
+    _, odometry, right = city(nodes, 0)
+    false = false_closures(right, nodes, 0.3, 'random', 0)
+    _, accepted, times = one_at_a_time([*odometry, *right, *false], timed)
+    return np.array(times), int(accepted.sum())
+
+
+def draw(path: Path, times: dict[str, dict[int, np.ndarray]]) -> None:
+    """Draw the median and the longest of the updates (ms) of each graph by its size."""
+    with page(path, 7, 4) as figure:
+        axes = figure.subplots()
+        for label, by_size in times.items():
+            medians, longest = np.array([(np.median(t), t.max()) for t in by_size.values()]).T
+            (line,) = axes.loglog(list(by_size), medians, 'o-', label=f'{label}, median')
+            color = line.get_color()
+            axes.loglog(list(by_size), longest, 's', ls=DASHES, c=color, label=f'{label}, longest')
+        sizes = sorted({size for by_size in times.values() for size in by_size})
+        axes.set_xticks(sizes, [f'{size:,}' for size in sizes], minor=False)
+        axes.minorticks_off()
+        axes.set(xlabel='nodes', ylabel='processor time of an update, ms')
+        legend_above(axes, 2)
+
+
 def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -62,17 +92,26 @@ def main() -> None:
     parser.add_argument('--updates', type=int, default=200, help='that are timed (%(default)s)')
     parser.add_argument('--drift', type=float, default=0.06, help='of the odometry (%(default)s)')
     parser.add_argument('--late', type=int, default=1, help='closures that come at once')
-    options = parser.parse_args()
+    parser.add_argument('--plot', type=Path, help='PNG of these and of city-like graphs')
+    options, all_times = parser.parse_args(), dict[str, dict[int, np.ndarray]]()
     print(f'{cpu_model()}, {commit()}: processor time of an update in ms\n')
-    print('| nodes | edges | median | 90 % | 99 % | most |')
-    print('|---|---|---|---|---|---|')
-    for nodes in options.nodes:
-        times, graph = measure(nodes, options.updates, options.drift, options.late)
+    print('| graph | nodes | edges | median | 90 % | 99 % | most |')
+    print('|---|---|---|---|---|---|---|')
+    for name, nodes in product(('laps', 'city')[: 1 + bool(options.plot)], options.nodes):
+        if name == 'laps':
+            times, graph = measure(nodes, options.updates, options.drift, options.late)
+            edges = len(graph.used)
+        else:
+            times, edges = measure_city(nodes, options.updates)
+        if edges:
+            all_times.setdefault(name, {})[nodes] = times
         p50, p90, p99, most = np.percentile(times, [50, 90, 99, 100])
         print(
-            f'| {nodes} | {len(graph.used)} | {p50:.0f} | {p90:.0f} | {p99:.0f} | {most:.0f} |',
+            f'| {name} | {nodes} | {edges} | {p50:.0f} | {p90:.0f} | {p99:.0f} | {most:.0f} |',
             flush=True,
         )
+    if options.plot:
+        draw(options.plot, all_times)
 
 
 if __name__ == '__main__':
