@@ -18,11 +18,12 @@ from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableEr
 from stavpr_ros.features import efficientnet_lite_file as lite
 from stavpr_ros.features import FeatureExtractor, onnx
 from stavpr_ros.features.efficientnet_lite import EfficientNetLite1
-from stavpr_ros.features.efficientnet_lite_file import EPSILON, FILE, HALVING, make_graph, POOLED
+from stavpr_ros.features.efficientnet_lite_file import EPSILON, FILES, HALVING, make_graph, POOLED
 from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.sources import open_source
 import torch
 from torch.nn import functional
 
@@ -34,7 +35,7 @@ with_wheel = pytest.mark.skipif(
 SIZE = 224  # a map of 7 x 7 cells
 STAGES = (1, 6), (3, 6), (3, 8), (4, 10), (4, 12)  # blocks and channels
 KERNELS = 3, 3, 5, 3, 5
-SHA256 = 'a6d888f7fdb40e808cb3d16849e5ce307b9b0653cc523788b24a9de51ae22c22'  # of the file
+FILE = FILES['cached'][0]
 TOLERANCE = 1e-5  # of onnxruntime against torch, of the largest value
 IMAGES = list(np.random.default_rng(1).integers(0, 256, (3, 90, 160, 3), np.uint8))
 
@@ -234,8 +235,6 @@ def test_file_is_looked_up_in_both_folders(network, model_folders, set_constants
 def test_first_use_makes_the_published_network(model_folders):
     """Numbers of efficientnet-lite-pytorch 0.1.0: ``_blocks.14`` of this image, means of 2 x 2."""
     made = FeatureExtractor('efficientnet_lite1')
-    # maps of different machines fit
-    assert hashlib.sha256((model_folders[1] / FILE).read_bytes()).hexdigest() == SHA256
     y, x, c = np.mgrid[:224, :224, :3]
     image = ((x * y // 16 + 80 * c) % 256).astype(np.uint8)
     maps = made._backbone.feature_maps([image])
@@ -251,9 +250,93 @@ def test_first_use_makes_the_published_network(model_folders):
 def test_file_needs_neither_torch_nor_onnx(model_folders):
     code = """import sys
 from stavpr_ros.features import FeatureExtractor
-FeatureExtractor('hybrid')
+from stavpr_ros.features.registry import HybridSettings
+for model in 'cached', 'int8':
+    FeatureExtractor('hybrid', HybridSettings(model=model))
 sys.exit(bool({'torch', 'onnx'} & set(sys.modules)))"""
     subprocess.run([sys.executable, '-c', code], check=True)
+
+
+@pytest.fixture(params=FILES)
+def made(request, model_folders):
+    """Return the name of a network, and its file, made of the wheel."""
+    return request.param, lite.make_file(request.param)
+
+
+@with_wheel
+def test_file_has_its_hash_wherever_it_is_made(made):
+    name, path = made
+    assert (path.name, hashlib.sha256(path.read_bytes()).hexdigest()) == FILES[name]
+
+
+@with_wheel
+@pytest.mark.parametrize('name', FILES)
+def test_map_takes_the_network_that_it_was_made_with(
+    name, model_folders, tmp_path, runner, set_constants
+):
+    write_images(tmp_path / 'drive', IMAGES)
+    path, file = tmp_path / 'a.stavpr', model_folders[1] / FILES[name][0]
+    options = '--features', 'hybrid', '--hybrid-model', name
+    runner(build_map)('--input', tmp_path / 'drive', '--output', path, *options)
+    assert open_map(path).settings.backbone.sha256 == FILES[name][1]
+    for model in '', *FILES:  # whatever is set for new maps
+        file.unlink()  # it is made again
+        assert open_map(path).extractor(model=model).settings == open_map(path).settings
+    moved = model_folders[0] / 'of_another_name.onnx'
+    moved.parent.mkdir()
+    file.rename(moved)
+    set_constants(lite, WHEEL='no_such_package')
+    assert open_map(path).extractor().settings == open_map(path).settings
+    moved.unlink()
+    expected = f'copy the file.*; it is {file.name}, and the package no-such-package'
+    with pytest.raises(UnavailableError, match=expected):
+        open_map(path).extractor()
+
+
+def cosines(images):
+    """Return the cosine of the maps of both networks, of each image."""
+    networks = (EfficientNetLite1(settings_class('efficientnet_lite1')(model=m)) for m in FILES)
+    maps = [network.feature_maps(images).reshape(len(images), -1) for network in networks]
+    return np.sum(maps[0] * maps[1], axis=1) / np.prod(np.linalg.norm(maps, axis=2), axis=0)
+
+
+@with_wheel
+def test_int8_network_is_near_the_float_one(model_folders, data_folder):
+    """Of images that its scales were not measured on."""
+    folders = 'walk_by_night/right_night', 'office_circuit/day1', 'gardens_point/day_right'
+    images = [
+        frame.image for name in folders for frame in list(open_source(data_folder / name))[::20]
+    ]
+    result = cosines(images)
+    assert result.min() > 0.976
+    assert np.median(result) > 0.993
+
+
+@with_wheel
+def test_int8_network_of_images_without_texture_is_near_the_float_one(model_folders):
+    gray = [np.full((60, 80, 3), value, np.uint8) for value in (0, 1, 60, 255)]
+    assert cosines([*gray, *IMAGES]).min() > 0.9
+
+
+@with_wheel
+def test_sums_of_products_fit_where_processors_add_them(model_folders):
+    """AVX2 without VNNI adds two products of a convolution that is not depthwise in 16 bits."""
+    onnx_package = pytest.importorskip('onnx')
+    model = onnx_package.load(lite.make_file('int8'))
+    steps = {
+        tensor.name: onnx_package.numpy_helper.to_array(tensor).astype(int)
+        for tensor in model.graph.initializer
+        if tensor.name.endswith(('.weight.steps', '.bias.steps'))
+    }
+    assert len(steps) == 2 * 45
+    for name, values in steps.items():
+        if name.endswith('.weight.steps'):
+            largest = abs(values).max()
+            assert largest == (127 if lite.DEPTHWISE in name else 63)
+            assert lite.DEPTHWISE in name or 2 * 255 * largest < 2**15
+            sums = 255 * abs(values).sum(axis=(1, 2, 3))
+            bias = steps[name.replace('.weight.', '.bias.')]
+            assert (sums + abs(bias)).max() < 2**31
 
 
 def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(
