@@ -41,6 +41,7 @@ from stavpr_lab.evaluation.metrics import (
 )
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, Map, select_places
 from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.error_rate import least_probability
@@ -397,7 +398,9 @@ def extractor(feature: str, folder: Path) -> FeatureExtractor:
     """
     if feature in FEATURES:
         return extractors(feature, folder)['robust']
-    return FeatureExtractor(KINDS[feature])
+    kind, *model = KINDS[feature].split()
+    settings = settings_class(kind)
+    return FeatureExtractor(kind, settings(model=model[0]) if model else settings())
 
 
 def extract_map(source: Any, making: FeatureExtractor) -> Map:
