@@ -319,9 +319,21 @@ def test_int8_network_of_images_without_texture_is_near_the_float_one(model_fold
 
 
 @with_wheel
+def test_convolutions_are_of_integers_and_sums_of_layers_are_not(model_folders, tmp_path):
+    """The quantized sum of two layers is rounded otherwise on ARM than on x86."""
+    onnx_package, runtime = onnx.import_onnx()
+    options = runtime.SessionOptions()
+    options.optimized_model_filepath, options.log_severity_level = str(tmp_path / 'net.onnx'), 3
+    runtime.InferenceSession(lite.make_file('int8'), options, providers=[onnx.ON_CPU])
+    nodes = [node.op_type for node in onnx_package.load(tmp_path / 'net.onnx').graph.node]
+    assert (nodes.count('QLinearConv'), nodes.count('Add')) == (45, 10)
+    assert not {'Conv', 'QLinearAdd'} & set(nodes)
+
+
+@with_wheel
 def test_sums_of_products_fit_where_processors_add_them(model_folders):
     """AVX2 without VNNI adds two products of a convolution that is not depthwise in 16 bits."""
-    onnx_package = pytest.importorskip('onnx')
+    onnx_package, _ = onnx.import_onnx()
     model = onnx_package.load(lite.make_file('int8'))
     steps = {
         tensor.name: onnx_package.numpy_helper.to_array(tensor).astype(int)
