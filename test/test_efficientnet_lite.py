@@ -23,6 +23,7 @@ from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.pipeline import PipelineSettings
 from stavpr_ros.sources import open_source
 import torch
 from torch.nn import functional
@@ -279,6 +280,8 @@ def test_map_takes_the_network_that_it_was_made_with(
     options = '--features', 'hybrid', '--hybrid-model', name
     runner(build_map)('--input', tmp_path / 'drive', '--output', path, *options)
     assert open_map(path).settings.backbone.sha256 == FILES[name][1]
+    of_node = PipelineSettings(features='hybrid', model_path=name).extractor()
+    assert of_node.settings.backbone.sha256 == FILES[name][1]
     for model in '', *FILES:  # whatever is set for new maps
         file.unlink()  # it is made again
         assert open_map(path).extractor(model=model).settings == open_map(path).settings
