@@ -1,25 +1,28 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The learned network in int8 beside float32: cosines of its maps, time on one thread.
+The learned network in int8 beside float32: cosines of its maps, time of 640x480 on one thread.
 
 ``python benchmarks/int8_network.py``; ``--scales`` measures and writes its committed table first:
 of each layer without ReLU6, the 256 values with the least mean square error on images of FITTED.
 """
 
 from functools import partial
+from itertools import product
 import json
 from pathlib import Path
 import sys
 import time
 
+import cv2
 from data import data_folder
 import numpy as np
 import onnx
 from stavpr_ros.features import efficientnet_lite_file as lite
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, MEAN, STD
 from stavpr_ros.features.onnx import Onnx
-from stavpr_ros.features.registry import EfficientNetSettings, OnnxSettings
+from stavpr_ros.features.registry import EfficientNetSettings, OnnxSettings, settings_class
 from stavpr_ros.sources import open_source
 from timing import measure
 
@@ -70,10 +73,10 @@ def write_scales() -> None:
     lite.make_file('int8')
 
 
-def seconds_of(network: EfficientNetLite1, images: list[np.ndarray]) -> float:
-    """Return the processor time of a call, on one thread."""
+def seconds_of(extractor: FeatureExtractor, image: np.ndarray) -> float:
+    """Return the processor time of an image, on one thread."""
     began = time.thread_time()
-    network.feature_maps(images)
+    extractor.extract([image])
     return time.thread_time() - began
 
 
@@ -88,7 +91,11 @@ def main() -> None:
         unit = [rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in maps]
         cosines = np.sum(unit[0] * unit[1], axis=1)
         print(f'{name}: cosine {cosines.min():.3f} at least, median {np.median(cosines):.3f}')
-    jobs = {name: partial(seconds_of, net, images[:1]) for name, net in networks.items()}
+    image = cv2.resize(images[0], (640, 480))
+    jobs = {}
+    for kind, name in product(('efficientnet_lite1', 'hybrid'), lite.FILES):
+        extractor = FeatureExtractor(kind, settings_class(kind)(model=name))
+        jobs[f'{kind} {name}'] = partial(seconds_of, extractor, image)
     for name, timing in measure(jobs, seconds=3).items():
         print(f'{name}: {1e3 * timing.median_s:.2f} ms, spread {1e3 * timing.spread_s:.2f}')
 

