@@ -59,8 +59,7 @@ def scale_of(values: np.ndarray) -> tuple[float, int]:
 def write_scales() -> None:
     """Measure the table, write it and the network."""
     images, model = [image for name in FITTED for image in images_of(name)], lite.find_file()
-    nodes = onnx.load(model).graph.node
-    table = {lite.INPUT: (1 / 128, 127)}  # its pixels, without an error
+    nodes, table = onnx.load(model).graph.node, {}
     sums = [node.output[0] for node in nodes if node.op_type == 'Add'][:-1]
     for layer in [n.output[0] for n in nodes if n.output[0].endswith('_project_conv')] + sums:
         network = Onnx(

@@ -10,10 +10,11 @@ file is the same wherever it is made. Neither torch nor the package onnx is need
 weights has a known hash and is a list of pickles with three names, which are built here; the ONNX
 file is a message of protocol buffers with six types of nodes.
 
-In int8, sums of products are exact, and equal on all processors: AVX2 without VNNI adds two of a
-1 x 1 convolution in 16 bits, so that its weights have 7. SCALES was measured; the mean of what
-rounding the weights changes is subtracted from the biases (Nagel et al., "Data-free quantization
-through weight equalization and bias correction", ICCV 2019).
+In int8, all sums of products are exact, and equal on all processors. AVX2 without VNNI adds two of
+a 1 x 1 convolution in 16 bits, so that its weights have 7. The first two layers, whose results
+need more than 8 bits, are of float32 with so many bits that no sum is rounded. SCALES was
+measured; the mean of what rounding the weights changes is subtracted from the biases (Nagel et
+al., "Data-free quantization through weight equalization and bias correction", ICCV 2019).
 """
 
 from collections import OrderedDict
@@ -48,7 +49,9 @@ OPSET, IR_VERSION = 17, 8
 INT, INTS = 2, 7  # types of an attribute, as ONNX numbers them
 TYPES = {'<f4': 1, 'u1': 2, 'i1': 3, '<i4': 6}  # of a tensor
 RELU, RELU6 = 6.0, '.relu6'  # largest value of ReLU6; ends the names of its layers
-MAX_BIAS = 2**30  # of a bias in int8, in its steps
+# in int8, tensors of float32 and the number that their values are multiples of
+GRIDS = {INPUT: 2.0**-7, f'_conv_stem{RELU6}': 2.0**-13}
+MAX_FLOAT, MAX_BIAS = 2**24, 2**30  # largest sum of float32, and bias in int8, in its steps
 NORMAL = np.round([NormalDist().inv_cdf((i + 0.5) / 64) for i in range(64)], 3)  # quantiles
 STORAGES = {'FloatStorage': '<f4', 'LongStorage': '<i8'}  # names in torch, types of numbers
 
@@ -286,7 +289,8 @@ class _Graph:
 
     def quantize(self, x: str, mean: np.ndarray) -> str:
         """Quantize a tensor, in int8; mean: of its channels, as the weights state it."""
-        if not self._scales:
+        if not self._scales or x in GRIDS:
+            self._quantized[x] = GRIDS.get(x, 1), mean
             return x
         scale, zero = (RELU / 255, 0) if x.endswith(RELU6) else self._scales[x]
         step = [self._constant(f'{x}.scale', scale), self._constant(f'{x}.zero', zero, 'u1')]
@@ -300,13 +304,29 @@ class _Graph:
         if not self._scales:
             return [self._constant(f'{name}.weight', kernel), self._constant(f'{name}.bias', bias)]
         x_scale, mean = self._quantized[x]
-        largest = 127 if kernel.shape[1] == 1 else 63
-        scale = abs(kernel).max(axis=(1, 2, 3)) / largest
-        scale = np.maximum(scale, abs(bias) / (MAX_BIAS * x_scale)).astype(np.float32)
-        steps = np.rint(kernel / scale[:, None, None, None])
-        change = (steps * scale[:, None, None, None] - kernel).sum(axis=(2, 3))
-        bias = bias - (change * (mean[:, None] if kernel.shape[1] == 1 else mean)).sum(axis=1)
+        is_depthwise, is_float = kernel.shape[1] == 1, x in GRIDS
+        if x == INPUT:
+            scale = np.full(len(kernel), min(GRIDS.values()) / x_scale)
+        elif is_float:  # powers of two, by which no sum is rounded
+            total = RELU * abs(kernel).sum(axis=(1, 2, 3)) + abs(bias) + EPSILON
+            scale = 2.0 ** np.ceil(np.log2(total / x_scale / MAX_FLOAT))
+        else:
+            scale = abs(kernel).max(axis=(1, 2, 3)) / (127 if is_depthwise else 63)
+            scale = np.maximum(scale, abs(bias) / (MAX_BIAS * x_scale)).astype(np.float32)
+        each = scale[:, None, None, None]
+        steps = np.rint(kernel / each)
+        if is_float:  # the sum over the cells of a filter stays: neighbors are much alike
+            sums = np.rint(np.cumsum((kernel / each).reshape(*kernel.shape[:2], -1), axis=2))
+            steps = np.diff(sums, axis=2, prepend=0).reshape(kernel.shape)
+        change = (steps * each - kernel).sum(axis=(2, 3))
+        bias = bias - (change * (mean[:, None] if is_depthwise else mean)).sum(axis=1)
         both, names = scale * np.float32(x_scale), []
+        if is_float:
+            bias = np.rint(bias / both) * both
+            return [
+                self._constant(f'{name}.weight', steps * each),
+                self._constant(f'{name}.bias', bias),
+            ]
         rows = ('weight', steps, 'i1', scale), ('bias', np.rint(bias / both), '<i4', both)
         for part, values, kind, step in rows:
             inputs = [
