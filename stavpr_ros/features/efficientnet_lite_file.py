@@ -11,10 +11,10 @@ weights has a known hash and is a list of pickles with three names, which are bu
 file is a message of protocol buffers with six types of nodes.
 
 In int8, all sums of products are exact, and equal on all processors. AVX2 without VNNI adds two of
-a 1 x 1 convolution in 16 bits, so that its weights have 7. The first two layers, whose results
-need more than 8 bits, are of float32 with so many bits that no sum is rounded. SCALES was
-measured; the mean of what rounding the weights changes is subtracted from the biases (Nagel et
-al., "Data-free quantization through weight equalization and bias correction", ICCV 2019).
+a 1 x 1 convolution in 16 bits, which limits the sums of neighboring weights. The first two layers,
+whose results need more than 8 bits, are of float32 with so many bits that no sum is rounded.
+SCALES was measured; the mean of what rounding the weights changes is subtracted from the biases:
+Nagel et al., "Data-free quantization through weight equalization and bias correction", ICCV 2019.
 """
 
 from collections import OrderedDict
@@ -311,7 +311,8 @@ class _Graph:
             total = RELU * abs(kernel).sum(axis=(1, 2, 3)) + abs(bias) + EPSILON
             scale = 2.0 ** np.ceil(np.log2(total / x_scale / MAX_FLOAT))
         else:
-            scale = abs(kernel).max(axis=(1, 2, 3)) / (127 if is_depthwise else 63)
+            pairs = kernel[:, 1:] + kernel[:, :-1]  # 255 * (127 + 1) < 2**15
+            scale = abs(np.concatenate([kernel, pairs], axis=1)).max(axis=(1, 2, 3)) / 127
             scale = np.maximum(scale, abs(bias) / (MAX_BIAS * x_scale)).astype(np.float32)
         each = scale[:, None, None, None]
         steps = np.rint(kernel / each)
