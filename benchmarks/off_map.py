@@ -19,6 +19,7 @@ from data import data_folder
 import numpy as np
 from off_map_page import (
     DAY,
+    INT8,
     JUMP,
     KINDS,
     LEVEL,
@@ -446,11 +447,14 @@ def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = options_parser(__doc__, 'gradient features, coarser steps; to off_map-quick')
-    parser.add_argument('--features', nargs='+', choices=tuple(KINDS), help='default: all')
+    parser.add_argument(
+        '--features', nargs='+', choices=tuple(KINDS), help=f'default: all but {INT8}'
+    )
     options = parser.parse_args(arguments)
     about, began = environment(named_commit=options.commit), time.perf_counter()
     steps = COARSER if options.quick else 1
-    features = options.features or (['g'] if options.quick else list(KINDS))
+    every = [feature for feature in KINDS if feature != INT8]
+    features = options.features or (['g'] if options.quick else every)
     results = measure(data_folder(), features, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     step = 'each' if steps == 1 else f'every {steps}th'
