@@ -100,7 +100,7 @@ distribution = setup(
     maintainer_email=MANIFEST.find('maintainer').get('email'),
     packages=packages,
     package_dir={sibling: f'{sibling}/{sibling}' for sibling in SIBLINGS},
-    package_data={'': ['py.typed', '*.html', '*.jinja']},
+    package_data={'': ['py.typed', '*.html', '*.jinja', '*.json']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

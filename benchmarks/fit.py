@@ -82,7 +82,7 @@ def constants_section(every: Sequence[Windows], values: Values) -> list[str]:
     """Return the lines on the constants K."""
     lines, cells = ['## Constants', '', CONSTANTS.strip(), ''], []
     for windows in every:
-        rows, kind = windows.decides, registry.KINDS[KINDS[windows.feature]]
+        rows, kind = windows.decides, registry.KINDS[KINDS[windows.feature].split()[0]]
         for name, k, weight in (
             ('', kind.with_cells, values['CELLS']),
             (', cells not compared', kind.constant, 0.0),

@@ -373,7 +373,7 @@ def probability(x: float) -> float:
 
 def values_now(features: Sequence[str]) -> Values:
     """Return the numbers of the evidence as they are in the code."""
-    constants = {f: registry.KINDS[KINDS[f]].with_cells for f in features}
+    constants = {f: registry.KINDS[KINDS[f].split()[0]].with_cells for f in features}
     return {name: float(value_of(name)) for name in REPLAYED} | constants
 
 

@@ -75,7 +75,7 @@ def is_right(truth: GroundTruth | None, image: int, place: int) -> bool:
 
 def routes_section(sets: Sets, feature: str) -> list[str]:
     """Return the lines on the closures of a kind of features."""
-    drives, kind = list(drives_twice(sets)), KINDS[feature]
+    drives, kind = list(drives_twice(sets)), KINDS[feature].split()[0]
     entry, cells = registry.KINDS[kind], []
 
     def measure(k: float) -> np.ndarray:

@@ -19,6 +19,7 @@ from data import data_folder
 import numpy as np
 from off_map_page import (
     DAY,
+    INT8,
     JUMP,
     KINDS,
     LEVEL,
@@ -41,6 +42,7 @@ from stavpr_lab.evaluation.metrics import (
 )
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, Map, select_places
 from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.error_rate import least_probability
@@ -397,7 +399,9 @@ def extractor(feature: str, folder: Path) -> FeatureExtractor:
     """
     if feature in FEATURES:
         return extractors(feature, folder)['robust']
-    return FeatureExtractor(KINDS[feature])
+    kind, *model = KINDS[feature].split()
+    settings = settings_class(kind)
+    return FeatureExtractor(kind, settings(model=model[0]) if model else settings())
 
 
 def extract_map(source: Any, making: FeatureExtractor) -> Map:
@@ -443,11 +447,14 @@ def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = options_parser(__doc__, 'gradient features, coarser steps; to off_map-quick')
-    parser.add_argument('--features', nargs='+', choices=tuple(KINDS), help='default: all')
+    parser.add_argument(
+        '--features', nargs='+', choices=tuple(KINDS), help=f'default: all but {INT8}'
+    )
     options = parser.parse_args(arguments)
     about, began = environment(named_commit=options.commit), time.perf_counter()
     steps = COARSER if options.quick else 1
-    features = options.features or (['g'] if options.quick else list(KINDS))
+    every = [feature for feature in KINDS if feature != INT8]
+    features = options.features or (['g'] if options.quick else every)
     results = measure(data_folder(), features, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     step = 'each' if steps == 1 else f'every {steps}th'

