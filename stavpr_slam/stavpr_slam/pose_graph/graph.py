@@ -204,14 +204,9 @@ class PoseGraph:
             return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
-        solution = without = decide_anew(*graph)
+        solution = decide_anew(*graph)
         while self.splits < tuning.MAX_BREAKS and (better := self._with_break(solution)):
             solution = better
-        # where none is accepted without breaks, a few false runs agree with them
-        if not without.accepted.any() and solution.accepted.sum() <= solution.rejected:
-            for node in self.chain.splits[::-1]:
-                self._split(node, False)
-            solution = without
         self._searched = len(self._sources)
         return solution
 
@@ -256,10 +251,12 @@ class PoseGraph:
         Return whether closures prove a break: more of them agree, or with more evidence.
 
         A break explains any false run behind it: the closures of the largest new event do not
-        count.
+        count, and where none agreed before, most have to agree.
         """
         agreed, agree = before.accepted, after.accepted
         numbers = events(self.chain, self._closures.query, self._closures.place)
+        if not agreed.any() and agree.sum() <= after.rejected:
+            return False
         is_new = agree & ~np.isin(numbers, numbers[agreed])
         sizes = np.unique(numbers[is_new], return_counts=True)[1]
         gain = after.decision.gain - before.decision.gain
