@@ -3,12 +3,25 @@
 """Each rule of the pose graph has a drive that is worse without it."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 from motions import exponentials
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import Closure, keyframes, network, optimize, PoseGraph, tuning
+from stavpr_slam.pose_graph import (
+    breaks,
+    Closure,
+    keyframes,
+    network,
+    optimize,
+    PoseGraph,
+    tuning,
+)
+from stavpr_slam.pose_graph import (
+    graph as graphs,
+)
+from stavpr_slam.pose_graph.solution import decide_anew
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
 
@@ -31,7 +44,7 @@ def false_shifts(count: int, share: float, run: int) -> list[int]:
 def false_drive(kind: str):
     """Return three laps, their odometry, and closures that are false, all or in a way."""
     truth, closures = circle(3) * [3.0, 3.0, 1.0], []
-    shifts = false_shifts(2 * LAP, 1.0, 20 if kind == 'runs' else 1)
+    shifts = false_shifts(2 * LAP, 1.0, {'runs': 20, 'long runs': 40}.get(kind, 1))
     for query, shift in zip(range(LAP, 3 * LAP), shifts, strict=True):
         place = query % LAP
         claimed = (place + (40 if kind == 'shift' else shift)) % LAP
@@ -45,7 +58,7 @@ def slight(truth, drift):
     return odometry_of(truth, drift=drift, seed=9)
 
 
-@pytest.mark.parametrize('kind', ['random', 'runs', 'shift', 'laps'])
+@pytest.mark.parametrize('kind', ['random', 'runs', 'long runs', 'shift', 'laps'])
 def test_only_false_closures_leave_the_odometry(kind):
     relative, graph = ratio(*false_drive(kind))
     assert relative < 1.02
@@ -217,6 +230,28 @@ def test_carried_robot_without_breaks(monkeypatch):
     monkeypatch.setattr(tuning, 'SUPPORT', 10**6)
     relative, graph = ratio(*carried_drive())
     assert (relative > 0.3, graph.splits) == (True, 0)
+
+
+def test_few_closures_of_several_events_prove_a_break(monkeypatch):
+    """Twenty closures in three stretches are before it."""
+    truth, odometry, closures = carried_drive()
+    stretches = [*range(100, 129, 14), *range(160, 260, 20)]
+    numbers = [(each.query_stamp // SECOND, each) for each in closures]
+    few = [each for number, each in numbers if any(0 < number - at < 8 for at in stretches)]
+    assert ratio(truth, odometry, few)[1].splits == 1
+    monkeypatch.setattr(breaks, '_support', len)
+    assert ratio(truth, odometry, few)[1].splits == 0
+
+
+def test_false_runs_are_tried_at_few_factors(monkeypatch):
+    """A break explains each run: a decision at all factors would be of no use."""
+    counting = Mock(wraps=decide_anew)
+    monkeypatch.setattr(graphs, 'decide_anew', counting)
+    ratio(*false_drive('long runs'))
+    assert [len(call.args) for call in counting.call_args_list].count(2) == 1
+    monkeypatch.setattr(PoseGraph, '_is_likely', lambda *_: True)
+    ratio(*false_drive('long runs'))
+    assert [len(call.args) for call in counting.call_args_list].count(2) > 2
 
 
 def test_break_is_at_a_pause(monkeypatch):

@@ -6,28 +6,43 @@ import numpy as np
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
+from stavpr_slam.pose_graph.decision import events
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
+Trial = tuple[np.ndarray, np.ndarray, int]  # a robust solution, see DriveSolution
 
-def find(
-    chain: KeyframeChain, solved: np.ndarray, accepted: np.ndarray, closures: ClosureArrays
-) -> list[int]:
-    """
-    Return the breaks that let most rejected closures agree, and then most of the rest.
 
-    :param solved: transforms of all nodes by the robust solution, (N, 4, 4).
-    :param accepted: whether each closure agrees with it, shape (n,).
-    """
-    query, place = closures.query, closures.place
-    candidates: list[tuple[int, int | None]] = []
+def find(chain: KeyframeChain, trials: list[Trial], closures: ClosureArrays) -> list[int]:
+    """Return the nodes behind breaks for which closures vote, the most of them first."""
+    query, numbers = closures.query, events(chain, closures.query, closures.place)
+    votes: dict[int, int] = {}
+    for nodes, accepted, bend in trials:
+        own = accepted & (bend >= 0) & (chain.session[query] == chain.session[bend])
+        sides = np.flatnonzero(own & (query < bend)), np.flatnonzero(own & (query >= bend))
+        for before, behind in (*_agreeing(chain, nodes, accepted, closures), sides):
+            count = _support if accepted[before].any() else len
+            if min(count(numbers[before]), count(numbers[behind])) >= tuning.SUPPORT:
+                node = _between(chain, query, before, behind)
+                votes[node] = max(votes.get(node, 0), _support(numbers[behind]))
+    return sorted(votes, key=lambda node: -votes[node])
+
+
+def _support(numbers: np.ndarray) -> int:
+    """Return the number of closures of events; a false run is one event."""
+    return min(2 * len(numbers), len(numbers) + tuning.JOINS * (len(np.unique(numbers)) - 1))
+
+
+def _agreeing(
+    chain: KeyframeChain, nodes: np.ndarray, accepted: np.ndarray, closures: ClosureArrays
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return closures before a break, and those rejected by a solution that agree behind it."""
+    query, place, result = closures.query, closures.place, []
     for session in np.unique(chain.session[query]).tolist():
         here = chain.session[query] == session
         own = np.flatnonzero(~accepted & here)
         own = own[:: len(own) // tuning.COMPARED + 1]
-        if len(own) < tuning.SUPPORT:
-            continue
-        votes = solved[place[own]] @ closures.transform[own] @ inverse(solved[query[own]])
-        points = solved[query[own], :3, 3].T
+        votes = nodes[place[own]] @ closures.transform[own] @ inverse(nodes[query[own]])
+        points = nodes[query[own], :3, 3].T
         at = votes[:, :3, :3] @ points + votes[:, :3, 3:]
         wide = np.linalg.eigvalsh(closures.covariance[own, 3:, 3:])[:, -1] ** 0.5
         away = np.linalg.norm(at - np.einsum('nin->in', at), axis=1)
@@ -39,36 +54,21 @@ def find(
             return result
 
         free = np.ones(len(own), bool)
-        for _ in range(tuning.SETS):
-            nodes = np.unique(query[own])[:: tuning.SUPPORT // 4]
-            members = max((most((query[own] >= node) & free) for node in nodes), key=np.sum)
+        for _ in range(tuning.SETS if len(own) else 0):
+            members = most(free)
             best, start = own[members], query[own[members]].min(initial=len(chain))
             before = np.flatnonzero(accepted & here & (query < start))
             if not len(before):
                 before = own[most(query[own] < start)]
-            candidates.append((-len(best), _between(chain, query, before, best)))
+            result.append((before, best))
             free &= ~members
-    candidates = sorted(candidates, key=lambda candidate: candidate[0])[: tuning.SETS]
-    return [node for _, node in candidates if node is not None]
-
-
-def find_at_bend(
-    chain: KeyframeChain, accepted: np.ndarray, query: np.ndarray, node: int
-) -> int | None:
-    """Return the break between the closures beside a bend of the odometry, as :func:`find`."""
-    if node < 0:
-        return None
-    own = accepted & (chain.session[query] == chain.session[node])
-    before, behind = np.flatnonzero(own & (query < node)), np.flatnonzero(own & (query >= node))
-    return _between(chain, query, before, behind)
+    return result
 
 
 def _between(
     chain: KeyframeChain, query: np.ndarray, before: np.ndarray, behind: np.ndarray
-) -> int | None:
+) -> int:
     """Return the node behind the longest pause between closures, else in the middle."""
-    if min(len(before), len(behind)) < tuning.SUPPORT:
-        return None
     last, first = query[before].max(), query[behind].min()
     at, number = chain.travelled, np.arange(len(chain))
     own = (chain.session == chain.session[first]) & (chain.previous >= 0)

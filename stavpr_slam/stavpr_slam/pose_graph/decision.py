@@ -126,8 +126,7 @@ class Decider:
         Events are drawn one by one, each by its number of closures, in any order: of n events of
         one size, k have 1 / binomial(n, k).
         """
-        sizes = np.sort(np.bincount(self._events[inliers]))[::-1]
-        sizes = sizes[sizes > 0]
+        sizes = np.sort(np.unique(self._events[inliers], return_counts=True)[1])[::-1]
         rest = len(inliers) - np.cumsum(sizes) + sizes
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 

@@ -200,17 +200,9 @@ class PoseGraph:
             return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
         for node in [*self.chain.splits][::-1]:
             self._split(node, False)
-        solution = without = decide_anew(*graph)
-        for _ in range(tuning.MAX_BREAKS):
-            better = self._with_break(solution)
-            if better is None:
-                break
+        solution = decide_anew(*graph)
+        while self.splits < tuning.MAX_BREAKS and (better := self._with_break(solution)):
             solution = better
-        # where none is accepted without breaks, a few false runs agree with them
-        if not without.accepted.any() and 2 * solution.accepted.sum() <= len(solution.accepted):
-            for node in [*self.chain.splits][::-1]:
-                self._split(node, False)
-            solution = without
         self._searched = len(self._sources)
         return solution
 
@@ -230,40 +222,43 @@ class PoseGraph:
 
     def _with_break(self, before: DriveSolution) -> DriveSolution | None:
         """Begin a session where closures prove that the robot was carried; None = nowhere."""
-        nodes = dict.fromkeys(
-            node
-            for solved, inliers, bend in before.trials
-            for node in (
-                *breaks.find(self.chain, solved, inliers, self._closures),
-                breaks.find_at_bend(self.chain, inliers, self._closures.query, bend),
-            )
-            if node is not None
-        )
-        for node in [*nodes][: tuning.MAX_BREAKS]:
+        for node in breaks.find(self.chain, before.trials, self._closures)[: tuning.SETS]:
             self._split(node, True)
-            after = decide_anew(self.chain, self._closures)
-            if (
-                self._more(before, after) >= tuning.GAIN
-                or after.decision.gain - before.decision.gain > tuning.EVIDENCE
-            ):
-                return after
+            if self._is_likely(before.decision.gain):
+                after = decide_anew(self.chain, self._closures)
+                if self._proves(before, after):
+                    return after
             self._split(node, False)
         return None
 
-    def _more(self, before: Solution, after: Solution) -> int:
-        """
-        Return how many closures more agree after a break.
+    def _is_likely(self, gain: float) -> bool:
+        """Return whether closures of several events agree, with as much gain, at two factors."""
+        numbers = events(self.chain, self._closures.query, self._closures.place)
+        for scale in tuning.SCALES[1:4:2]:
+            scales = np.full(len(self.chain.robots), scale)
+            trial = decide_anew(self.chain, self._closures, scales)
+            sizes = np.bincount(numbers[trial.accepted])
+            if trial.decision.gain >= gain and sizes.sum() - sizes.max(initial=0) >= tuning.GAIN:
+                return True
+        return False
 
-        A break explains any false run behind it: where closures agreed before, the closures of
-        the largest new event do not count.
+    def _proves(self, before: DriveSolution, after: DriveSolution) -> bool:
+        """
+        Return whether closures prove a break: more of them agree, or with more evidence.
+
+        A break explains any false run behind it: the closures of the largest new event do not
+        count, and where none agreed before, most have to agree.
         """
         agreed, agree = before.accepted, after.accepted
-        more = int(agree.sum() - agreed.sum())
-        if not agreed.any():
-            return more
         numbers = events(self.chain, self._closures.query, self._closures.place)
-        new = numbers[agree & ~np.isin(numbers, numbers[agreed])]
-        return more - int(np.bincount(new).max(initial=0))
+        if not agreed.any() and 2 * agree.sum() <= len(agree):
+            return False
+        is_new = agree & ~np.isin(numbers, numbers[agreed])
+        sizes = np.unique(numbers[is_new], return_counts=True)[1]
+        gain = after.decision.gain - before.decision.gain
+        if agree.sum() - agreed.sum() - sizes.max(initial=0) >= tuning.GAIN:
+            return gain >= 0
+        return len(sizes) >= tuning.EVENTS and gain > 2 * tuning.LOOSER
 
     # results
 
