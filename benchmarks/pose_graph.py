@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument('--plot', type=Path, help='PNG of these and of city-like graphs')
     options, all_times = parser.parse_args(), dict[str, dict[int, np.ndarray]]()
     print(f'{cpu_model()}, {commit()}: processor time of an update in ms\n')
-    print('| graph | nodes | edges | median | 90 % | 99 % | most |')
+    print('| graph | nodes | accepted | median | 90 % | 99 % | most |')
     print('|---|---|---|---|---|---|---|')
     for name, nodes in product(('laps', 'city')[: 1 + bool(options.plot)], options.nodes):
         if name == 'laps':
