@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import (
-    breaks,
     Closure,
     keyframes,
     network,
@@ -230,17 +229,6 @@ def test_carried_robot_without_breaks(monkeypatch):
     monkeypatch.setattr(tuning, 'SUPPORT', 10**6)
     relative, graph = ratio(*carried_drive())
     assert (relative > 0.3, graph.splits) == (True, 0)
-
-
-def test_few_closures_of_several_events_prove_a_break(monkeypatch):
-    """Twenty closures in three stretches are before it."""
-    truth, odometry, closures = carried_drive()
-    stretches = [*range(100, 129, 14), *range(160, 260, 20)]
-    numbers = [(each.query_stamp // SECOND, each) for each in closures]
-    few = [each for number, each in numbers if any(0 < number - at < 8 for at in stretches)]
-    assert ratio(truth, odometry, few)[1].splits == 1
-    monkeypatch.setattr(breaks, '_support', len)
-    assert ratio(truth, odometry, few)[1].splits == 0
 
 
 def test_false_runs_are_tried_at_few_factors(monkeypatch):

@@ -6,7 +6,6 @@ import numpy as np
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
-from stavpr_slam.pose_graph.decision import events
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 Trial = tuple[np.ndarray, np.ndarray, int]  # a robust solution, see DriveSolution
@@ -14,22 +13,15 @@ Trial = tuple[np.ndarray, np.ndarray, int]  # a robust solution, see DriveSoluti
 
 def find(chain: KeyframeChain, trials: list[Trial], closures: ClosureArrays) -> list[int]:
     """Return the nodes behind breaks for which closures vote, the most of them first."""
-    query, numbers = closures.query, events(chain, closures.query, closures.place)
-    votes: dict[int, int] = {}
+    query, votes = closures.query, dict[int, int]()
     for nodes, accepted, bend in trials:
         own = accepted & (bend >= 0) & (chain.session[query] == chain.session[bend])
         sides = np.flatnonzero(own & (query < bend)), np.flatnonzero(own & (query >= bend))
         for before, behind in (*_agreeing(chain, nodes, accepted, closures), sides):
-            count = _support if accepted[before].any() else len
-            if min(count(numbers[before]), count(numbers[behind])) >= tuning.SUPPORT:
+            if min(len(before), len(behind)) >= tuning.SUPPORT:
                 node = _between(chain, query, before, behind)
-                votes[node] = max(votes.get(node, 0), _support(numbers[behind]))
+                votes[node] = max(votes.get(node, 0), len(behind))
     return sorted(votes, key=lambda node: -votes[node])
-
-
-def _support(numbers: np.ndarray) -> int:
-    """Return the number of closures of events; a false run is one event."""
-    return min(2 * len(numbers), len(numbers) + tuning.JOINS * (len(np.unique(numbers)) - 1))
 
 
 def _agreeing(

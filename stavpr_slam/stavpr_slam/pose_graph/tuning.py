@@ -42,7 +42,7 @@ SAMPLE = 100  # closures between sessions that vote, and poses that they move, a
 # breaks of the odometry: the robot was carried
 GAIN = 24  # closures more that agree if there is a break, beside the largest new event, or
 EVENTS = 3  # new events, of two times the evidence of other errors of the odometry
-SUPPORT = 32  # closures on each side of a break; each event but one counts as JOINS more
+SUPPORT = 32  # closures on each side of a break
 SPREAD = 2.0  # meters, and deviations of two closures, that agreeing ones are apart
 PAUSE = 1.5  # times the usual time between keyframes: the robot was carried then
 SETS = 2  # of closures that agree on another path
