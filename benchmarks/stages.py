@@ -333,7 +333,7 @@ def process_stages(run: Run, n: int, precision: str) -> None:
         pipeline.change(replace(pipeline.settings, min_probability=limit))
         i = next(following)
         result = pipeline.operation.process(ImageRecord.of_image(images[i], 0), i, poses[i])
-        pipeline.operation.matched_pair(result)
+        pipeline.operation.matched_pair(result.match)
         accepted[min_probability] += result.match.accepted
 
     for _ in range(2 * SEQUENCE.length):
