@@ -23,7 +23,7 @@ PEERS = {'torch float32': 's--', 'faiss flat': 'd--', 'prange': '^--'}
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw image distances, the filter, and frames of mode robust, at the least dimensions."""
-    least = min((row.d for row in rows if row.d and row.n > 1), default=0)
+    least = min((row.d for row in rows if row.stage == 'frame' and row.d), default=0)
     panels = (
         ('image_distances', f'distances of {least} dimensions', least),
         ('filter_update', 'place filter', 0),
