@@ -27,9 +27,9 @@ from stavpr_ros.ros.messages import nanoseconds
 from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import ChainSettings, Closure, OdometryNoise
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
-from stavpr_slam.ros.bridges.external_keyframes import keyframe_edge, nearest
+from stavpr_slam.ros.bridges.bridge import Bridge
 from stavpr_slam.ros.bridges.poses import RobotLocalizationBridge
+from stavpr_slam.ros.bridges.rtabmap import keyframe_edge, nearest, RtabmapBridge
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
 from test_pose_graph_node import Peer
@@ -93,9 +93,10 @@ def test_bridge_without_target_is_usage_error(target, capsys):
     assert 'rtabmap, rtabmap_global_pose' in capsys.readouterr().err
 
 
-def test_interfaces_of_missing_package_is_error_that_names_it():
-    with pytest.raises(UnavailableError, match=r'package other_msgs \(its source\): install'):
-        interfaces('other_msgs', 'its source', 'msg')
+def test_bridge_without_the_messages_of_its_target_is_error_that_names_them(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'rtabmap_msgs', None)
+    with pytest.raises(UnavailableError, match=r'package rtabmap_msgs \(ros-jazzy-.*\): install'):
+        RtabmapBridge()
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,9 @@ def test_pose_of_a_relocalization_waits_for_a_subscriber():
     counts = iter([0, 1, 1, 0, 1])
     publisher = SimpleNamespace(get_subscription_count=lambda: next(counts))
     bridge = SimpleNamespace(_last=-11 * SECOND, _gap=10 * SECOND, _publisher=publisher)
-    causes = [RobotLocalizationBridge.reason_to_skip(bridge, LoopClosure()) for _ in range(5)]
+    bridge.publish = lambda *_: ''
+    rows = [(bridge, LoopClosure(), closure(np.zeros(7)))] * 5
+    causes = [RobotLocalizationBridge.take(*row) for row in rows]
     assert causes == ['without_subscriber', '', 'not_relocalized', 'without_subscriber', '']
 
 
@@ -155,11 +158,8 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
         assert counts['robot_localization_bridge: bridge']['sent'] == '2'
         assert (priors[0].header.frame_id, poses[0].header.frame_id) == ('base_link', 'map')
         first = poses[0].pose
-        np.testing.assert_allclose(
-            matrices(pose_array(first.pose)),
-            Drive().at(sent[0].place_index - AHEAD + LAP),
-            atol=1e-6,
-        )
+        expected = Drive().at(sent[0].place_index - AHEAD + LAP)
+        np.testing.assert_allclose(matrices(pose_array(first.pose)), expected, atol=1e-6)
         assert nanoseconds(poses[1].header.stamp) == nanoseconds(
             sent[-2].relative_pose.query_stamp
         )

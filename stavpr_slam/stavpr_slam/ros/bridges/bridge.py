@@ -3,7 +3,6 @@
 """Base of all bridges: parameters, loop closures in, counts, diagnostics."""
 
 from collections import Counter
-import importlib
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -11,7 +10,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.checks import require_above
-from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.errors import InputError
 from stavpr_ros.ros.diagnostics import one_status
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.ros.graph_messages import closure_of, CLOSURE_QOS
@@ -31,28 +30,10 @@ REMEDIES = {
 }
 
 
-def interfaces(package: str, source: str, kind: str) -> Any:
-    """
-    Import the interfaces of another package.
-
-    :param source: where the package is from.
-    :param kind: 'msg' or 'srv'.
-    :raises UnavailableError: it is not installed.
-    """
-    try:
-        return importlib.import_module(f'{package}.{kind}')
-    except ImportError as error:
-        raise UnavailableError(
-            f'this bridge requires the package {package} ({source}): install or build it, and '
-            'source its workspace before the bridge is started'
-        ) from error
-
-
 class Bridge(Node):
     """
     Passes loop closures of ``stavpr/loop_closure`` on; a subclass has its target.
 
-    :raises UnavailableError: the messages of the target are not installed.
     :raises SettingsError: an invalid parameter.
     """
 

@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.transforms import matrices, to_poses
-from stavpr_ros.ros.messages import nanoseconds, pose_message
+from stavpr_ros.ros.messages import pose_message
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.ros.bridges.bridge import Bridge
@@ -31,24 +31,14 @@ class PoseBridge(Bridge):
         super().__init__()
         self._publisher = self.create_publisher(PoseWithCovarianceStamped, self.TOPIC, 10)
 
-    def frame(self, message: LoopClosure) -> str:
-        """Return the frame_id of the pose."""
-        return str(message.pose_frame)
-
-    def reason_to_skip(self, message: LoopClosure) -> str:
-        """Return why a pose is left out, empty = it is not."""
-        return '' if message.relative_pose.is_independent else 'not_independent'
-
-    def take(self, message: LoopClosure, closure: Closure) -> str:
-        """Publish the pose of a closure on a map."""
-        if cause := self.reason_to_skip(message):
-            return cause
+    def publish(self, message: LoopClosure, closure: Closure, frame: str) -> str:
+        """Publish the pose of a closure on a map, in a frame of this name; return no cause."""
         assert closure.place_pose is not None
         place = matrices(closure.place_pose)
         turn = np.kron(np.eye(2), place[:3, :3])
         result = PoseWithCovarianceStamped()
         result.header.stamp = message.relative_pose.query_stamp
-        result.header.frame_id = self.frame(message)
+        result.header.frame_id = frame
         result.pose.pose = pose_message(to_poses(place @ matrices(closure.pose)))
         result.pose.covariance = (turn @ closure.covariance @ turn.T).ravel()
         self._publisher.publish(result)
@@ -78,12 +68,12 @@ class RobotLocalizationBridge(PoseBridge):
         self._gap = round(self.given['relocalization_gap'] * SECOND)
         self._last = -self._gap - 1
 
-    def reason_to_skip(self, message: LoopClosure) -> str:
-        """Return why all but the first closure after a gap are left out."""
-        stamp = nanoseconds(message.relative_pose.query_stamp)
+    def take(self, message: LoopClosure, closure: Closure) -> str:
+        """Publish the pose of the first closure after a gap."""
+        stamp = closure.query_stamp
         is_new = not 0 <= stamp - self._last <= self._gap
         if not self._publisher.get_subscription_count():  # a filter that starts later needs one
             self._last = -self._gap - 1
             return 'without_subscriber'
         self._last = stamp
-        return '' if is_new else 'not_relocalized'
+        return self.publish(message, closure, message.pose_frame) if is_new else 'not_relocalized'

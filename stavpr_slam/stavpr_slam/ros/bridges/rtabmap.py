@@ -2,25 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """RTAB-Map: edges by its service ``add_link``, or poses on a map by its topic ``global_pose``."""
 
+from collections.abc import Mapping
 from functools import partial
+from pkgutil import resolve_name
 from typing import Any, ClassVar
 
 from nav_msgs.msg import Odometry
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.transforms import to_poses
+from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
 from stavpr_ros.ros.messages import nanoseconds, odometry_pose, transform_message
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import body_covariance, ChainSettings, Closure, OdometryNoise
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.transforms import TRANSLATION_FIRST
-from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
-from stavpr_slam.ros.bridges.external_keyframes import keyframe_edge, nearest
+from stavpr_slam.ros.bridges.bridge import Bridge
 from stavpr_slam.ros.bridges.poses import PoseBridge
 from stavpr_slam.ros.graph_messages import ODOMETRY_QOS
 
-PACKAGE = 'rtabmap_msgs', 'ros-jazzy-rtabmap-msgs'
+INTERFACES = 'rtabmap_msgs.msg:Info', 'rtabmap_msgs.msg:Link', 'rtabmap_msgs.srv:AddLink'
 USER_CLOSURE = 4  # rtabmap::Link::kUserClosure
 MAX_PENDING = 1000  # closures that wait for keyframes
 
@@ -31,6 +32,8 @@ class RtabmapBridge(Bridge):
 
     ``rtabmap/info`` has the nodes: ``ref_id`` at ``header.stamp``. RTAB-Map checks the graph with
     the new link (RGBD/OptimizeMaxError) and does not report the result.
+
+    :raises UnavailableError: its messages are not installed.
     """
 
     NAME, IS_ON_MAP = 'rtabmap', False
@@ -44,8 +47,13 @@ class RtabmapBridge(Bridge):
     }
 
     def __init__(self) -> None:
-        self._messages: Any = interfaces(*PACKAGE, 'msg')
-        self._service: Any = interfaces(*PACKAGE, 'srv').AddLink
+        try:
+            info, self._link, self._service = map(resolve_name, INTERFACES)
+        except ImportError as error:
+            raise UnavailableError(
+                'this bridge requires the package rtabmap_msgs (ros-jazzy-rtabmap-msgs): install '
+                'or build it, and source its workspace before the bridge is started'
+            ) from error
         super().__init__()
         self._pending: list[Closure] = []
         self._sent: set[tuple[int, int]] = set()
@@ -53,7 +61,7 @@ class RtabmapBridge(Bridge):
         self._odometry = KeyframeChain(ChainSettings(), OdometryNoise())
         self._client = self.create_client(self._service, 'rtabmap/add_link')
         self.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
-        self.create_subscription(self._messages.Info, 'rtabmap/info', self._on_info, 100)
+        self.create_subscription(info, 'rtabmap/info', self._on_info, 100)
 
     def on_timer(self) -> None:
         """Send what waited for RTAB-Map, and publish the diagnostics."""
@@ -105,7 +113,7 @@ class RtabmapBridge(Bridge):
             else:
                 self._sent.add((place[0], query[0]))
                 transform, covariance = keyframe_edge(closure, place[1], query[1])
-                link = self._messages.Link(from_id=place[0], to_id=query[0], type=USER_CLOSURE)
+                link = self._link(from_id=place[0], to_id=query[0], type=USER_CLOSURE)
                 link.transform = transform_message(to_poses(transform), '', '').transform
                 information = np.linalg.inv(body_covariance(covariance, transform))
                 link.information = information[TRANSLATION_FIRST].ravel()
@@ -124,6 +132,46 @@ class GlobalPoseBridge(PoseBridge):
 
     NAME, TOPIC = 'rtabmap_global_pose', 'global_pose'
 
-    def frame(self, message: LoopClosure) -> str:
-        """Return the frame of the base."""
-        return str(message.relative_pose.frame)
+    def take(self, message: LoopClosure, closure: Closure) -> str:
+        """Publish the pose of each independent closure."""
+        if not closure.is_independent:
+            return 'not_independent'
+        return self.publish(message, closure, message.relative_pose.frame)
+
+
+def nearest(
+    keyframes: Mapping[int, int], odometry: KeyframeChain, max_gap: int, stamp: int
+) -> tuple[int, np.ndarray] | None:
+    """
+    Return the nearest keyframe, and the transform (4, 4) from it to a stamp (ns).
+
+    :param keyframes: their numbers by stamp.
+    :param max_gap: ns between an image and its keyframe at most.
+    :returns: None without a keyframe that is near and whose motion to the stamp is known.
+    """
+    if not keyframes:
+        return None
+    best = min(keyframes, key=lambda own: abs(own - stamp))
+    motion = odometry.motion(best, stamp) if best != stamp else np.eye(4)
+    if abs(best - stamp) > max_gap or motion is None:
+        return None
+    return keyframes[best], motion
+
+
+def keyframe_edge(
+    closure: Closure, place: np.ndarray, query: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Move a loop closure to the keyframes next to its images.
+
+    :param place, query: transforms (4, 4) from the keyframe to the image, whose errors are left
+        out.
+    :returns: the pose of the query's keyframe in the frame of the place's, (4, 4), and its
+        covariance: x y z, rotations about the fixed axes of the place's, (6, 6).
+    """
+    after, motion = inverse(query), matrices(closure.pose)
+    # t' = A (t + R b): an error of the rotation R also moves the end of the motion b
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = -cross((motion[:3, :3] @ after[:3, 3])[None])[0]
+    jacobian = np.kron(np.eye(2), place[:3, :3]) @ jacobian
+    return place @ motion @ after, jacobian @ closure.covariance @ jacobian.T
