@@ -19,7 +19,6 @@ from geometry_msgs.msg import (
     PoseWithCovarianceStamped,
     TransformStamped,
 )
-from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 from stavpr_msgs.msg import (
@@ -350,9 +349,9 @@ def record_message(record: ImageRecord) -> Image:
     return fill(Image(), record, header=header, is_bigendian=is_bigendian, data=data)
 
 
-def odometry_pose(message: Odometry) -> np.ndarray:
-    """Return the pose of an odometry message, shape (7,), float64."""
-    p, o = message.pose.pose.position, message.pose.pose.orientation
+def pose_array(message: Pose) -> np.ndarray:
+    """Return a pose message as x y z and quaternion x y z w, shape (7,), float64."""
+    p, o = message.position, message.orientation
     return np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
 
 

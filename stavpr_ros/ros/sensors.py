@@ -19,7 +19,7 @@ from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of, yaw_of
 from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.input import BEST_EFFORT, subscribe
-from stavpr_ros.ros.messages import camera_of, nanoseconds, odometry_pose
+from stavpr_ros.ros.messages import camera_of, nanoseconds, pose_array
 from stavpr_ros.sources.oddities import RECENT, speed_oddity
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
@@ -90,7 +90,7 @@ class OdometryInput:
         self._node.destroy_subscription(self._subscription)
 
     def _on_odometry(self, message: Odometry) -> None:
-        stamp, pose = nanoseconds(message.header.stamp), odometry_pose(message)
+        stamp, pose = nanoseconds(message.header.stamp), pose_array(message.pose.pose)
         try:
             self.trajectory.add(stamp, pose)
         except InputError as error:

@@ -23,14 +23,13 @@ from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.ros.messages import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds, pose_array
 from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import ChainSettings, Closure, OdometryNoise
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.ros.bridges.bridge import Bridge
 from stavpr_slam.ros.bridges.poses import RobotLocalizationBridge
 from stavpr_slam.ros.bridges.rtabmap import keyframe_edge, nearest, RtabmapBridge
-from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
 from test_pose_graph_node import Peer
 

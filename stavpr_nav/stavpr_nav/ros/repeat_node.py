@@ -38,7 +38,7 @@ from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.messages import camera_of, nanoseconds, odometry_pose
+from stavpr_ros.ros.messages import camera_of, nanoseconds, pose_array
 from stavpr_ros.ros.rclpy_workarounds import log_failure
 from stavpr_ros.ros.sensors import camera_info_topic
 from stavpr_ros.sources.encodings import decode_message
@@ -280,10 +280,10 @@ class RepeatNode(Node):
 
     def _on_odometry(self, message: Odometry) -> None:
         assert self._odometry is not None
-        header, stamp = message.header, nanoseconds(message.header.stamp) / SECOND
+        stamp, pose = nanoseconds(message.header.stamp) / SECOND, pose_array(message.pose.pose)
         try:
             with self._lock:
-                self._odometry.take(header.frame_id, stamp, odometry_pose(message), self._now())
+                self._odometry.take(message.header.frame_id, stamp, pose, self._now())
         except InputError as error:
             self.get_logger().warning(f'odometry is not used: {error}', throttle_duration_sec=10.0)
 

@@ -3,14 +3,13 @@
 """Messages of the pose graph: loop closures in; paths, poses and markers out."""
 
 import struct
-from typing import Any
 
 from geometry_msgs.msg import Point
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.palette import BLUE, rgb, VERMILION
-from stavpr_ros.ros.messages import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds, pose_array
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.pose_graph.alignment import APPEARANCE
@@ -38,28 +37,20 @@ def closure_of(message: LoopClosure, appearance: bool = False) -> Closure | None
     relative = message.relative_pose
     if relative.source in (RelativePose.REFUTED, RelativePose.DROPPED):
         return None
+    is_measured = message.has_relative_pose and relative.source != RelativePose.NONE
+    pose, covariance = pose_array(relative.pose.pose), relative.pose.covariance.reshape(6, 6)
+    stamps: LoopClosure | RelativePose = relative
+    if not is_measured:
+        if not appearance:
+            return None
+        pose[:3], covariance, stamps = 0, APPEARANCE, message  # turned by the mountings
     on_map = message.query_index < 0 and message.has_poses
-    on_a_map: dict[str, Any] = {
-        'map_id': (message.map_id or 'map') if on_map else '',
-        'place_pose': pose_array(message.place_pose) if on_map else None,
-    }
-    if message.has_relative_pose and relative.source != RelativePose.NONE:
-        covariance = np.array(relative.pose.covariance).reshape(6, 6)
-        return Closure(
-            nanoseconds(relative.query_stamp), nanoseconds(relative.place_stamp),
-            pose_array(relative.pose.pose), covariance, relative.is_independent, **on_a_map,
-        )  # fmt: skip
-    if not appearance:
-        return None
-    stamps = nanoseconds(message.query_stamp), nanoseconds(message.place_stamp)
-    by_mounting = np.append(np.zeros(3), pose_array(relative.pose.pose)[3:])
-    return Closure(*stamps, by_mounting, APPEARANCE, False, **on_a_map)
-
-
-def pose_array(pose: object) -> np.ndarray:
-    """Return a pose message as x y z and quaternion x y z w, shape (7,)."""
-    p, o = pose.position, pose.orientation  # type: ignore[attr-defined]
-    return np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
+    return Closure(
+        nanoseconds(stamps.query_stamp), nanoseconds(stamps.place_stamp), pose, covariance,
+        is_measured and relative.is_independent,
+        (message.map_id or 'map') if on_map else '',
+        pose_array(message.place_pose) if on_map else None,
+    )  # fmt: skip
 
 
 def path_bytes(frame: str, stamps: np.ndarray, poses: np.ndarray) -> bytes:
@@ -91,13 +82,12 @@ def edge_markers(frame: str, accepted: np.ndarray, rejected: np.ndarray) -> Mark
     """Return the ends of edges, (m, 2, 3), as lines: accepted ones blue, rejected vermilion."""
     markers = MarkerArray()
     for number, (ends, color) in enumerate(((accepted, ACCEPTED), (rejected, REJECTED))):
-        marker = Marker(ns='closures', id=number, type=Marker.LINE_LIST, action=Marker.ADD)
+        action = Marker.ADD if len(ends) else Marker.DELETE
+        marker = Marker(ns='closures', id=number, type=Marker.LINE_LIST, action=action)
         marker.header.frame_id = frame
         marker.pose.orientation.w = 1.0
         marker.scale.x = 0.15
         marker.color = color
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in ends.reshape(-1, 3).tolist()]
-        if not marker.points:
-            marker.action = Marker.DELETE
         markers.markers.append(marker)
     return markers

@@ -25,12 +25,7 @@ from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.messages import (
-    nanoseconds,
-    odometry_pose,
-    pose_message,
-    transform_message,
-)
+from stavpr_ros.ros.messages import nanoseconds, pose_array, pose_message, transform_message
 from stavpr_ros.ros.navigation import tf_message
 from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
@@ -222,7 +217,7 @@ class PoseGraphNode(ManagedNode):
 
     def _on_odometry(self, robot: str, message: Odometry) -> None:
         assert self._graph is not None
-        pose, stamp = odometry_pose(message), nanoseconds(message.header.stamp)
+        pose, stamp = pose_array(message.pose.pose), nanoseconds(message.header.stamp)
         stated = message.pose.covariance
         covariance = stated.tolist() if stated.any() else None
         self.counts['odometry'] += 1

@@ -12,7 +12,7 @@ import numpy as np
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError, UnavailableError
 from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
-from stavpr_ros.ros.messages import nanoseconds, odometry_pose, transform_message
+from stavpr_ros.ros.messages import nanoseconds, pose_array, transform_message
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import body_covariance, ChainSettings, Closure, OdometryNoise
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
@@ -78,7 +78,7 @@ class RtabmapBridge(Bridge):
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            self._odometry.add(nanoseconds(message.header.stamp), odometry_pose(message))
+            self._odometry.add(nanoseconds(message.header.stamp), pose_array(message.pose.pose))
         except InputError as error:
             self.counts['invalid_odometry'] += 1
             self.get_logger().warning(f'odometry rejected: {error}', throttle_duration_sec=10.0)
