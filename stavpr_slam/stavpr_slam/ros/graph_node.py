@@ -3,7 +3,6 @@
 """The pose-graph node: odometry and loop closures in, corrected poses out."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 import gc
@@ -15,8 +14,6 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.qos import QoSProfile
-from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.checks import require_above, require_at_least
@@ -116,17 +113,12 @@ class PoseGraphNode(ManagedNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         group = MutuallyExclusiveCallbackGroup
         self.create_timer(PERIOD, self._publish_diagnostics, group(), steady)
-        for kind, name, serve in (
-            (SaveMap, '~/save', self._save),
-            (Trigger, '~/reset', self._reset),
-        ):
+        services = (SaveMap, '~/save', self._save), (Trigger, '~/reset', self._reset)
+        for kind, name, serve in services:
             repeat_responses(self.create_service(kind, name, serve, callback_group=group()))
-        self._start: Timer | None = None
-        if values['autostart']:
-            self._start = self.create_timer(0.0, self._on_start, group(), steady)
+        self._start = self.create_timer(0.0, self._on_start, group(), steady, values['autostart'])
 
     def _on_start(self) -> None:
-        assert self._start is not None
         self._start.cancel()
         if self.advance(self.trigger_configure):
             self.advance(self.trigger_activate)
@@ -157,17 +149,12 @@ class PoseGraphNode(ManagedNode):
         """Subscribe."""
         result = super().on_activate(state)
         group = MutuallyExclusiveCallbackGroup()
-        topics: list[tuple[type, str, Callable[..., None], QoSProfile]] = [
-            (
-                Odometry,
-                f'{robot}/odom'.lstrip('/'),
-                partial(self._on_odometry, robot),
-                ODOMETRY_QOS,
-            )
-            for robot in self._robots
-        ]
-        topics += [(LoopClosure, topic, self._on_closure, CLOSURE_QOS) for topic in self._topics]
-        self._entities = [self.create_subscription(*row, callback_group=group) for row in topics]
+        subscribe = partial(self.create_subscription, callback_group=group)
+        for robot in self._robots:
+            topic, take = f'{robot}/odom'.lstrip('/'), partial(self._on_odometry, robot)
+            self._entities.append(subscribe(Odometry, topic, take, ODOMETRY_QOS))
+        for topic in self._topics:
+            self._entities.append(subscribe(LoopClosure, topic, self._on_closure, CLOSURE_QOS))
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -314,10 +301,6 @@ class PoseGraphNode(ManagedNode):
 
     def _save(self, request: Any, response: Any) -> Any:
         try:
-            if not request.path:
-                raise StavprError(
-                    "path = '' is no file: set one that ends in .g2o, .tum or .kitti"
-                )
             path = inside(self._folder, request.path)
             if self._graph is None:
                 raise StavprError(f'the node is {self.state}: configure it')
