@@ -43,8 +43,7 @@ def step_errors(ends: np.ndarray, noise: OdometryNoise) -> np.ndarray:
     middle = np.eye(4)[None]
     middle[0, :3, 3] = ends[:, :3, 3].mean(axis=0)
     moved = adjoints(middle)[0] * np.repeat([noise.rotation, noise.translation], 3)
-    spread: np.ndarray = max(length, SHORTEST) * moved @ moved.T
-    return spread
+    return max(length, SHORTEST) * moved @ moved.T
 
 
 def message_growth(

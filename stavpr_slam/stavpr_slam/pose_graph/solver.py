@@ -35,9 +35,9 @@ def _between(a, b, result):
 
 
 @kernel
-def _move(poses, at, steps, result):
-    """Write poses times the exponentials of twists, by their elements that are variables."""
-    twist, result[:] = np.zeros(6), poses
+def _move(poses, at, steps):
+    """Return poses times the exponentials of twists, by their elements that are variables."""
+    twist, result = np.zeros(6), poses.copy()
     for k in range(len(poses)):
         for a in range(len(at)):
             twist[at[a]] = steps[k, a]
@@ -60,6 +60,7 @@ def _move(poses, at, steps, result):
                 + (b + twice * q + third * v) * twist[4]
                 + (c + twice * r + third * w) * twist[5]
             )
+    return result
 
 
 @kernel
@@ -104,20 +105,23 @@ def _logarithm(T, twist, derivative):
 
 
 @kernel
-def _linearize(poses, ends, motions, information, at, errors, jacobians, local, deviations):
+def _linearize(poses, ends, motions, information, at):
     """
-    Write the errors of factors, their derivatives by the first pose, and the squared deviations.
+    Return the errors of factors, their derivatives, information, and the squared deviations.
 
     :param ends: first and second pose of each factor, (m, 2); the first is -1 for the origin.
     :param at: d elements of a twist that are variables.
-    :param jacobians, local: written, (m, d, d): derivatives, and information, of a twist of the
-        second pose. The error is the same as a twist: it is an eigenvector of its derivative.
+    :returns: errors (m, d), derivatives by the first pose, and information, of a twist of the
+        second pose, (m, d, d) each. The error is the same as a twist: it is an eigenvector of its
+        derivative.
     """
-    d = len(at)
+    m, d = len(ends), len(at)
+    errors, deviations = np.empty((m, d)), np.zeros(m)
+    jacobians, local = np.empty((m, d, d)), np.zeros((m, d, d))
     origin, step, off, twist = np.eye(4), np.eye(4), np.eye(4), np.zeros(6)
     adjoint, derivative = np.zeros((6, 6)), np.zeros((6, 6))
     own, product = np.empty((d, d)), np.empty((d, d))
-    for f in range(len(ends)):
+    for f in range(m):
         i, j = ends[f]
         _between(origin if i < 0 else poses[i], poses[j], step)
         _between(motions[f], step, off)
@@ -127,18 +131,18 @@ def _linearize(poses, ends, motions, information, at, errors, jacobians, local, 
             for a in range(3):
                 adjoint[a, b] = adjoint[a + 3, b + 3] = -step[b, a]
                 adjoint[a + 3, b] = step[c, a] * step[e, 3] - step[e, a] * step[c, 3]
-        deviations[f] = 0.0
         for a in range(d):
             errors[f, a] = twist[at[a]]
             for b in range(d):
                 jacobians[f, a, b] = adjoint[at[a], at[b]]
                 own[a, b] = derivative[at[a], at[b]]
-        product[:], local[f] = 0.0, 0.0
+        product[:] = 0.0
         _add(product, 1.0, information[f], own)
         _add(local[f], 1.0, own.T, product)
         for a in range(d):
             for b in range(d):
                 deviations[f] += information[f, a, b] * errors[f, a] * errors[f, b]
+    return errors, jacobians, local, deviations
 
 
 @kernel
@@ -297,8 +301,7 @@ def _covariances(starts, rows, blocks, columns, jacobians, result):
 def squares(innovations: np.ndarray) -> np.ndarray:
     """Return the squared deviations of factors, (n,), see :meth:`Solver.innovations`."""
     errors, variances = np.split(innovations[:, :-1], 2, axis=1)
-    result: np.ndarray = (errors**2 / (1 + variances)).sum(axis=1)
-    return result
+    return (errors**2 / (1 + variances)).sum(axis=1)
 
 
 def likelihoods(innovations: np.ndarray) -> np.ndarray:
@@ -368,15 +371,10 @@ class Solver:
 
     def linearize(self, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
         """Return the squared deviations of all factors, (V + n,), and keep their derivatives."""
-        count, d = len(self.ends), len(self.at)
-        self._errors, self._local = np.empty((count, d)), np.empty((count, d, d))
-        self._jacobians = np.empty((count, d, d))
-        result = np.empty(count)
-        _linearize(
-            poses, self.ends, self.motions, information, self.at, self._errors, self._jacobians,
-            self._local, result,
-        )  # fmt: skip
-        return result
+        self._errors, self._jacobians, self._local, deviations = _linearize(
+            poses, self.ends, self.motions, information, self.at
+        )
+        return deviations
 
     def step(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """
@@ -387,13 +385,12 @@ class Solver:
         :raises LinAlgError: the poses have no unique solution.
         """
         pattern, blocks, x, determinant = self._decomposed(weights)
-        result = np.empty_like(poses)
         if math.isfinite(determinant):
             _solve(pattern.starts, pattern.rows, blocks, x)
-            _move(poses, self.at, x[pattern.place, 0], result)
-        if not math.isfinite(determinant) or not np.isfinite(result).all():
-            raise np.linalg.LinAlgError('the pose graph has no unique solution')
-        return result, determinant
+            result = _move(poses, self.at, x[pattern.place, 0])
+            if np.isfinite(result).all():
+                return result, determinant
+        raise np.linalg.LinAlgError('the pose graph has no unique solution')
 
     def _decomposed(self, weights: np.ndarray) -> tuple[Pattern, np.ndarray, np.ndarray, float]:
         """Return the pattern, the blocks of the root, the right side, and its determinant."""

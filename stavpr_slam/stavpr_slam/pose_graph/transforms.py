@@ -30,8 +30,7 @@ def body_covariance(covariance: np.ndarray, transform: np.ndarray) -> np.ndarray
     turn = transform[:3, :3].T
     change = np.zeros((6, 6))
     change[:3, 3:] = change[3:, :3] = turn
-    result: np.ndarray = change @ covariance @ change.T
-    return result
+    return change @ covariance @ change.T
 
 
 def adjoints(motions: np.ndarray) -> np.ndarray:
