@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ros2 run stavpr_slam bridge TARGET``: loop closures for other SLAM systems and filters."""
 
-import importlib
+from pkgutil import resolve_name
 import sys
 from typing import Any
 
 from stavpr_ros.signals import run_until_signal
 
 TARGETS = {
-    'rtabmap': ('rtabmap', 'RtabmapBridge', 'Adds loop closures to RTAB-Map as user closures.'),
-    'rtabmap_global_pose': ('rtabmap', 'GlobalPoseBridge', 'Publishes the pose on a map as '
+    'rtabmap': ('rtabmap:RtabmapBridge', 'Adds loop closures to RTAB-Map as user closures.'),
+    'rtabmap_global_pose': ('rtabmap:GlobalPoseBridge', 'Publishes the pose on a map as '
                             '``global_pose``, a prior of RTAB-Map; without its messages.'),
-    'robot_localization': ('poses', 'RobotLocalizationBridge', 'Publishes ``~/pose`` for a '
+    'robot_localization': ('poses:RobotLocalizationBridge', 'Publishes ``~/pose`` for a '
                            '``poseN`` of robot_localization, once per relocalization.'),
 }  # fmt: skip
 HELP = """usage: bridge TARGET [--ros-args -p NAME:=VALUE ... -r stavpr/loop_closure:=TOPIC]
@@ -45,8 +45,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _class(target: str) -> Any:
-    module, name, _ = TARGETS[target]
-    return getattr(importlib.import_module(f'stavpr_slam.ros.bridges.{module}'), name)
+    return resolve_name(f'stavpr_slam.ros.bridges.{TARGETS[target][0]}')
 
 
 def _describe(target: str) -> str:

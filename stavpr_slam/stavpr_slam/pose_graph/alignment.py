@@ -44,9 +44,7 @@ def align_maps(reference: np.ndarray, poses: np.ndarray, pairs: np.ndarray) -> n
             f'{len(chosen)} of {len(pairs)} recognized places agree on a transform: expected maps '
             'with a common stretch; leave --align out to keep both frames'
         )
-    ends = np.array(chosen)
-    T = graph.chain.transforms
-    source, target = T[ends[:, 0], :3, 3], T[ends[:, 1], :3, 3]
+    source, target = (graph.chain.transforms[nodes, :3, 3] for nodes in np.array(chosen).T)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     yaw = math.atan2(cross.sum(), (a[:, :2] * b[:, :2]).sum())

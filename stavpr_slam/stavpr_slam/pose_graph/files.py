@@ -22,13 +22,12 @@ def tum_text(stamps: np.ndarray, poses: np.ndarray) -> str:
     """
     Return a trajectory in the TUM format.
 
-    :param stamps: ns, shape (N,); poses of NaN are left out.
+    :param stamps: ns, shape (N,).
     :param poses: shape (N, 7).
     """
     lines = [
         f'{stamp // SECOND}.{stamp % SECOND:09d} ' + ' '.join(f'{value:.9g}' for value in pose)
         for stamp, pose in zip(stamps.tolist(), poses, strict=True)
-        if np.isfinite(pose).all()
     ]
     return TUM_HEADER + '\n'.join(lines) + '\n'
 

@@ -96,8 +96,8 @@ class KeyframeChain:
         pose = normalize_pose(pose)
         if stamp <= 0:
             raise InputError(f'odometry with stamp {stamp}: expected nanoseconds above 0')
-        current = self._current.get(robot)
-        cause, is_keyframe = self._break(current, stamp, pose), True
+        current, is_keyframe = self._current.get(robot), True
+        cause = '' if current is None else self._break(current, stamp, pose)
         if current is None or cause:
             if current is not None:
                 self.breaks.append((robot, cause))
@@ -119,10 +119,8 @@ class KeyframeChain:
             self._append(current, covariance)
         return is_keyframe
 
-    def _break(self, current: OdometryTrack | None, stamp: int, pose: np.ndarray) -> str:
+    def _break(self, current: OdometryTrack, stamp: int, pose: np.ndarray) -> str:
         """Return why a new session begins; empty = none does."""
-        if current is None:
-            return 'start'
         seconds = (stamp - current.newest[0]) / SECOND
         if seconds < -0.5:
             return f'the stamps jumped back by {-seconds:.3f} s'

@@ -20,10 +20,6 @@ __all__ = ['closure_of']  # the public names
 
 ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-ACCEPTED, REJECTED = (
-    ColorRGBA(r=red / 255, g=green / 255, b=blue / 255, a=0.8)
-    for red, green, blue in (rgb(BLUE), rgb(VERMILION))
-)
 
 
 def closure_of(message: LoopClosure, appearance: bool = False) -> Closure | None:
@@ -81,13 +77,14 @@ def path_bytes(frame: str, stamps: np.ndarray, poses: np.ndarray) -> bytes:
 def edge_markers(frame: str, accepted: np.ndarray, rejected: np.ndarray) -> MarkerArray:
     """Return the ends of edges, (m, 2, 3), as lines: accepted ones blue, rejected vermilion."""
     markers = MarkerArray()
-    for number, (ends, color) in enumerate(((accepted, ACCEPTED), (rejected, REJECTED))):
+    for number, (ends, color) in enumerate(((accepted, BLUE), (rejected, VERMILION))):
         action = Marker.ADD if len(ends) else Marker.DELETE
         marker = Marker(ns='closures', id=number, type=Marker.LINE_LIST, action=action)
         marker.header.frame_id = frame
         marker.pose.orientation.w = 1.0
         marker.scale.x = 0.15
-        marker.color = color
+        red, green, blue = (level / 255 for level in rgb(color))
+        marker.color = ColorRGBA(r=red, g=green, b=blue, a=0.8)
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in ends.reshape(-1, 3).tolist()]
         markers.markers.append(marker)
     return markers
