@@ -32,7 +32,6 @@ distribution = setup(
     python_requires='>=3.11',
     install_requires=[
         'numpy>=1.26',
-        'opencv-python-headless>=4.6',
         'scipy>=1.11',
         'stavpr_ros',
     ],

@@ -6,18 +6,18 @@ from collections.abc import Iterator, Sequence
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.output_file import atomic_folder
 from stavpr_ros.sources import open_source
 
 NEIGHBORS = 5  # places before a place that it is paired with
 BESIDE = 1  # places beside a recognized place that its query is paired with as well
-JPEG = cv2.IMWRITE_JPEG_QUALITY, 95
+QUALITY = 95  # of JPEG
 ALL = 1000.0  # images per second of a video: all of them
 
 
@@ -50,8 +50,7 @@ def export(
         for place, image in _images(place_map, images, topic, camera):
             height, width = image.shape[:2]
             sizes[place] = width, height
-            _, encoded = cv2.imencode('.jpg', image[..., ::-1], JPEG)
-            (new / 'images' / _name(place)).write_bytes(encoded.tobytes())
+            (new / 'images' / _name(place)).write_bytes(encode_jpeg(image, QUALITY))
         if not sizes:
             raise InputError(
                 'the map has no thumbnails: name the folder or bag that it is of (--images)'

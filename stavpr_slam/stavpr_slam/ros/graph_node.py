@@ -328,8 +328,7 @@ class PoseGraphNode(ManagedNode):
             **{name.replace(' ', '_'): count for name, count in counts.items()},
             'last_problem': '; '.join(self._problems.values()),
         }
-        level, text = self._health(counts, graph)
-        self._diagnostics.publish(one_status(self, 'graph', level, text, values))
+        self._diagnostics.publish(one_status(self, 'graph', *self._health(counts, graph), values))
 
     def _health(self, counts: Counter[str], graph: Counter[str]) -> tuple[bytes, str]:
         """Return the level of the diagnostics and the reason with its remedy."""

@@ -173,7 +173,6 @@ class GraphServer:
 def run_server(connection: Connection, parent: int, *arguments: Any) -> None:
     """Serve requests until the parent has ended; in the child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal, which the parent obeys
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if sys.platform == 'linux':  # a solution may last long before the end of the pipe is noticed
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
     if os.getppid() != parent:

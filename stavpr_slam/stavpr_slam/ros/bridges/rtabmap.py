@@ -98,13 +98,12 @@ class RtabmapBridge(Bridge):
         """Request the links whose keyframes are known; later ones wait."""
         if not self._client.service_is_ready():
             return
-        waiting, newest = [], max(self._keyframes, default=0)
+        newest = max(self._keyframes, default=0)
+        ready = [closure for closure in self._pending if closure.query_stamp <= newest]
+        self._pending = [closure for closure in self._pending if closure.query_stamp > newest]
         gap = round(self.given['max_keyframe_gap'] * SECOND)
         near = partial(nearest, self._keyframes, self._odometry, gap)
-        for closure in self._pending:
-            if closure.query_stamp > newest:
-                waiting.append(closure)
-                continue
+        for closure in ready:
             query, place = map(near, (closure.query_stamp, closure.place_stamp))
             if query is None or place is None:
                 self.counts['no_keyframe'] += 1
@@ -119,7 +118,6 @@ class RtabmapBridge(Bridge):
                 link.information = information[TRANSLATION_FIRST].ravel()
                 self._client.call_async(self._service.Request(link=link))
                 self.counts['sent'] += 1
-        self._pending = waiting
 
 
 class GlobalPoseBridge(PoseBridge):
