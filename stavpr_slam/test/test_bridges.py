@@ -59,9 +59,9 @@ def test_keyframe_edge_covariance_is_that_of_samples():
     moved = np.tile(start, (20000, 1, 1))
     moved[:, :3, :3] = Rotation.from_rotvec(samples[:, 3:]).as_matrix() @ start[:3, :3]
     moved[:, :3, 3] += samples[:, :3]
-    end = before @ moved @ motion
-    turns = Rotation.from_matrix(end[:, :3, :3] @ transform[:3, :3].T).as_rotvec()
-    errors = np.concatenate([end[:, :3, 3] - transform[:3, 3], turns], axis=1)
+    off = inverse(transform) @ before @ moved @ motion
+    turns = Rotation.from_matrix(off[:, :3, :3]).as_rotvec()
+    errors = np.concatenate([turns, off[:, :3, 3]], axis=1)
     np.testing.assert_allclose(np.cov(errors.T), covariance, atol=2e-3)
 
 

@@ -11,12 +11,12 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError, UnavailableError
-from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.messages import nanoseconds, pose_array, transform_message
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import body_covariance, ChainSettings, Closure, OdometryNoise
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.pose_graph.transforms import TRANSLATION_FIRST
+from stavpr_slam.pose_graph.transforms import adjoints, TRANSLATION_FIRST
 from stavpr_slam.ros.bridges.bridge import Bridge
 from stavpr_slam.ros.bridges.poses import PoseBridge
 from stavpr_slam.ros.graph_messages import ODOMETRY_QOS
@@ -114,8 +114,7 @@ class RtabmapBridge(Bridge):
                 transform, covariance = keyframe_edge(closure, place[1], query[1])
                 link = self._link(from_id=place[0], to_id=query[0], type=USER_CLOSURE)
                 link.transform = transform_message(to_poses(transform), '', '').transform
-                information = np.linalg.inv(body_covariance(covariance, transform))
-                link.information = information[TRANSLATION_FIRST].ravel()
+                link.information = np.linalg.inv(covariance)[TRANSLATION_FIRST].ravel()
                 self._client.call_async(self._service.Request(link=link))
                 self.counts['sent'] += 1
 
@@ -165,11 +164,8 @@ def keyframe_edge(
     :param place, query: transforms (4, 4) from the keyframe to the image, whose errors are left
         out.
     :returns: the pose of the query's keyframe in the frame of the place's, (4, 4), and its
-        covariance: x y z, rotations about the fixed axes of the place's, (6, 6).
+        covariance in the axes of the query's, rotation first, (6, 6).
     """
-    after, motion = inverse(query), matrices(closure.pose)
-    # t' = A (t + R b): an error of the rotation R also moves the end of the motion b
-    jacobian = np.eye(6)
-    jacobian[:3, 3:] = -cross((motion[:3, :3] @ after[:3, 3])[None])[0]
-    jacobian = np.kron(np.eye(2), place[:3, :3]) @ jacobian
-    return place @ motion @ after, jacobian @ closure.covariance @ jacobian.T
+    motion, turn = matrices(closure.pose), adjoints(query[None])[0]  # of twists in its axes
+    covariance = turn @ body_covariance(closure.covariance, motion) @ turn.T
+    return place @ motion @ inverse(query), covariance
