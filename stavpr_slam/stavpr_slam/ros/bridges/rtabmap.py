@@ -142,12 +142,10 @@ def nearest(
     """
     Return the nearest keyframe, and the transform (4, 4) from it to a stamp (ns).
 
-    :param keyframes: their numbers by stamp.
+    :param keyframes: their numbers by stamp, at least one.
     :param max_gap: ns between an image and its keyframe at most.
-    :returns: None without a keyframe that is near and whose motion to the stamp is known.
+    :returns: None where the keyframe is not near, or its motion to the stamp is unknown.
     """
-    if not keyframes:
-        return None
     best = min(keyframes, key=lambda own: abs(own - stamp))
     motion = odometry.motion(best, stamp) if best != stamp else np.eye(4)
     if abs(best - stamp) > max_gap or motion is None:
