@@ -88,10 +88,8 @@ class PoseGraphNode(ManagedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('pose_graph', **options)
-        values = {
-            name: self.declare_parameter(name, default).value
-            for name, (default, _) in PARAMETERS.items()
-        }
+        rows = [(name, default) for name, (default, _) in PARAMETERS.items()]
+        values = {row.name: row.value for row in self.declare_parameters('', rows)}
         self._frame, self._topics = str(values['map_frame']), list(values['loop_closure_topics'])
         self._appearance = bool(values['appearance_edges'])
         self._folder = maps_folder(values['maps_folder'])

@@ -43,10 +43,8 @@ class Bridge(Node):
 
     def __init__(self) -> None:
         super().__init__(f'{self.NAME}_bridge')
-        self.given = {
-            name: self.declare_parameter(name, default).value
-            for name, (default, _) in self.PARAMETERS.items()
-        }
+        rows = [(name, default) for name, (default, _) in self.PARAMETERS.items()]
+        self.given = {row.name: row.value for row in self.declare_parameters('', rows)}
         for name, value in self.given.items():
             if isinstance(value, float):
                 require_above(name, value, 0)
