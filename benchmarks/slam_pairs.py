@@ -58,12 +58,12 @@ class Found:
 class SharedViews(EdgeEstimator):
     """Keeps the views of all draws of a world: they do not depend on odometry."""
 
-    views: ClassVar[dict[bytes, View]] = {}
+    views: ClassVar[dict[bytes, View | None]] = {}
 
-    def _view(self, image: np.ndarray, camera: Camera) -> View:
-        key = image.tobytes()
+    def _view_of(self, pair: MatchedPair, index: int, camera: Camera) -> View | None:
+        key = pair.thumbnails[index]
         if key not in self.views:
-            self.views[key] = super()._view(image, camera)
+            self.views[key] = super()._view_of(pair, index, camera)
         return self.views[key]
 
 
