@@ -221,8 +221,8 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
         texts = [f'{best["f1"]:.4f}']
         texts += [f'{default[k]:.4f}' if default else '-' for k in ('precision', 'recall')]
         lines.append([*row, *texts, f'{best["recall_at_100_precision"]:.4f}', '-'])
-    head = ('data set', 'features', 'mode', 'speed', 'best F1', 'P at default', 'R at default')
-    head += ('R at 100 % P', 'unknown matched')
+    head = ['data set', 'features', 'mode', 'speed', 'best F1', 'P at default', 'R at default']
+    head += ['R at 100 % P', 'unknown matched']
     return [*heading('Accuracy', 'make accuracy', about), *table(head, lines)]
 
 

@@ -186,9 +186,8 @@ def lines(results: list[dict[str, Any]]) -> list[str]:
             *(f'{exact["processor_ms"]:.0f}', f'{exact["wall_ms_p50"]:.0f}'),
             *(f'{one["threads"]}', f'{one["load"]:.1f}'),
         ])  # fmt: skip
-    head = 'case', 'places', 'dimensions', 'precision / recall', 'processor ms'
-    head += 'elapsed ms', 'threads', 'load'
-    return table(head, rows)
+    head = 'case', 'places', 'dimensions', 'precision / recall', 'processor ms', 'elapsed ms'
+    return table([*head, 'threads', 'load'], rows)
 
 
 def add_result(new: dict[str, Any]) -> list[dict[str, Any]]:

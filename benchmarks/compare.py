@@ -47,7 +47,7 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
 
     settings = FeatureSettings('gradient', None)
     place_map = descriptor_map(features(strips, weights))
-    limit = {'threshold': 1.0} if mode == 'paper' else {'min_probability': 1e-9}
+    limit: dict[str, Any] = {'threshold': 1.0} if mode == 'paper' else {'min_probability': 1e-9}
     recognizer = PlaceRecognizer(
         place_map, RecognizerSettings(mode=mode, **limit), 'cpu', precision
     )
@@ -127,7 +127,7 @@ def compare(
     """
     for checkout in (this, other):
         checkout.run(**case)
-    ours, theirs = [], []
+    ours, theirs = list[float](), list[float]()
     for _ in range(rounds):
         # the first frame after the other process ran refills the caches: it does not count
         replies = [checkout.run(frames=frames + 1) for checkout in (this, other)]
@@ -149,7 +149,7 @@ def answers(checkout: Path) -> dict[str, list[Any]]:
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(map(str, folders))}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, 'answers.json')
-        command = [sys.executable, checkout / 'test' / 'shared' / 'golden.py', '--all', file]
+        command = [sys.executable, str(checkout / 'test/shared/golden.py'), '--all', str(file)]
         subprocess.run(command, env=environment, check=True)
         return json.loads(file.read_text())
 

@@ -24,16 +24,7 @@ import time
 from typing import Any
 
 from results import table
-from soak import (
-    about,
-    HEIGHT,
-    image_message,
-    make_map,
-    memory,
-    publish,
-    texture_route,
-    WIDTH,
-)
+from soak import about, HEIGHT, image_message, make_map, memory, publish, texture_route, WIDTH
 
 WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
 TURN, SETTLED_TURNS = 50, 4  # images of each map in turn, and turns before times count
@@ -137,8 +128,8 @@ def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[s
             total = times.get('all', [])[-IMAGES:]
         time.sleep(1 / rate if rate else 0)
         process(messages[number % VIEWS], (number + 1) * 10**8, list_candidates=False)
-    assert recognizer is not None
-    size = recognizer.places * 7 * 224 * (1 if precision == 'int8' else 4) // 4
+    assert operation.places is not None
+    size = len(operation.places) * 7 * 224 * (1 if precision == 'int8' else 4) // 4
     content, read = np.ones(size, np.float32), reader(threads)
     call = time_calls('reading the map', lambda: read(content))
     for _ in range(50):
@@ -194,7 +185,8 @@ def measure_sessions(counts: list[int]) -> list[str]:
         strips /= np.linalg.norm(strips, axis=2, keepdims=True)
         return replace(route, features=replace(route.features, strips=strips))
 
-    raw, rows, one_session = drive(1000).features, [], ()
+    raw, rows = drive(1000).features, []
+    one_session: tuple[float, int] | None = None
     for precision, dimension in (('float32', 0), ('int8', 0), ('int8', DIMENSIONS)):
         recognizers, queries, sizes, medians = [], [], [], []
         for count in counts:
@@ -204,6 +196,7 @@ def measure_sessions(counts: list[int]) -> list[str]:
             query = raw
             if dimension:
                 one = with_principal_components(one, dimension)
+                assert one.projection is not None
                 query = replace(raw, strips=raw.strips @ one.projection.matrix, cells=None)
                 normalize(query.strips)
                 query = replace(query, settings=one.features.settings)

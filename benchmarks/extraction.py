@@ -15,7 +15,8 @@ import numpy as np
 from run import Peer, Run
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.extractor import cut_strips, normalize
-from stavpr_ros.features.gradient import FLOOR, GradientSettings
+from stavpr_ros.features.gradient import FLOOR
+from stavpr_ros.features.registry import GradientSettings
 from stavpr_ros.mapping import small_gray
 from stavpr_ros.sources.encodings import decode_message
 from timing import timed_job

@@ -49,7 +49,7 @@ from stavpr_lab.style import DASHES, legend_above, page
 from stavpr_ros.features import registry
 from stavpr_ros.method import error_rate
 from stavpr_ros.method.evidence import log_odds
-from stavpr_ros.method.localizer import EARLY
+from stavpr_ros.method.model import EARLY
 from stavpr_ros.palette import INK, SKY, VERMILION
 
 # ------------------------------------------------ page
@@ -107,7 +107,7 @@ def draw(risks: Risks, path: Path) -> None:
     with page(path, 11, 5) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, (rows, side, what) in zip(panels, sides, strict=True):
-            means = []
+            means: list[float] = []
             for error in errors:
                 wrong, matched = (counts[rows] for counts in count_matches(risks, error))
                 rates = np.sort(wrong[matched > 0] / matched[matched > 0])

@@ -27,8 +27,7 @@ from off_map_page import KINDS
 from stavpr_ros.features import registry
 from stavpr_ros.method import localizer, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.evidence import log_odds, probability_of
-from stavpr_ros.method.localizer import EARLY
-from stavpr_ros.method.model import MODEL
+from stavpr_ros.method.model import EARLY, MODEL
 from stavpr_ros.threads import limit_threads
 
 LENGTH = RecognizerSettings().sequence.length
@@ -336,7 +335,10 @@ def _middle_images(images: np.ndarray) -> np.ndarray:
 
 
 @nb.njit
-def scores_of(x, drive, early, kind, constant, numbers):  # type: ignore[no-untyped-def]
+def scores_of(
+    x: np.ndarray, drive: np.ndarray, early: np.ndarray, kind: np.ndarray, constant: float,
+    numbers: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Return the log odds of windows as :mod:`stavpr_ros.method.evidence` has them."""
     out, newest, likely, count = np.empty(len(x)), -np.inf, 0.5, 0.0
     w_belief, w_lead, w_cells, w_recent, certain, w_uneven, limit, w_excess = numbers[:8]

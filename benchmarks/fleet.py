@@ -90,7 +90,7 @@ def run(
     places = np.array(drive_places(recognizer, query, times))
     middles = first + np.arange(len(places)) + (SETTINGS.sequence.length - 1) // 2
     right = np.count_nonzero(abs(places - middles) <= TOLERANCE)
-    matched = np.count_nonzero(places >= 0)
+    matched = int(np.count_nonzero(places >= 0))
     off = drive_places(recognizer, off_the_map, times)
     return (
         f'{right / max(matched, 1):.3f} | {right / len(places):.3f} | '

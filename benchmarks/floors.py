@@ -52,9 +52,9 @@ def drive(
 def main() -> None:
     """Print the table."""
     floors = sorted(path for path in (data_folder() / 'tower').iterdir() if path.is_dir())
-    columns = ('floor', 'images', 'matched', 'right floor, of these', 'most probable floor right')
-    columns += ('images until a match', 'with `~/reset`: matched', 'right floor')
-    columns += ('matched on the map of the floor alone',)
+    columns = ['floor', 'images', 'matched', 'right floor, of these', 'most probable floor right']
+    columns += ['images until a match', 'with `~/reset`: matched', 'right floor']
+    columns += ['matched on the map of the floor alone']
     print(f'| {" | ".join(columns)} |\n|{len(columns) * "---|"}')
     total = np.zeros(8, int)
     with tempfile.TemporaryDirectory() as folder:

@@ -28,7 +28,7 @@ DEVIATIONS = np.array([0.03, 0.03, 0.015])  # of all edges, m and rad
 def streets(nodes: int, dice: np.random.Generator) -> np.ndarray:
     """Return poses in the plane on a square of streets, each visited five times, (nodes, 3)."""
     blocks = max(3, round((nodes / (10 * STREET)) ** 0.5))
-    crossing, heading, poses = np.array([blocks // 2] * 2), 0, []
+    crossing, heading, poses = np.array([blocks // 2] * 2), 0, list[list[float]]()
     while len(poses) < nodes:
         for turn in (*dice.permutation([-1, 0, 1]), 2):
             way = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[(heading + turn) % 4]
@@ -82,17 +82,8 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, nargs='+', default=[0, 1])
     options = parser.parse_args()
     print(f'{cpu_model()}, {commit()}', flush=True)
-    head = (
-        'nodes',
-        'false',
-        'draw',
-        'closures, false',
-        'recall',
-        'false accepted',
-        'ATE, m',
-        's',
-        'MB',
-    )
+    head = ['nodes', 'false', 'draw', 'closures, false', 'recall', 'false accepted']
+    head += ['ATE, m', 's', 'MB']
     print('\n'.join(table(head, [])[:2]), flush=True)
     for job in product(options.nodes, options.kinds, options.shares, options.seeds):
         print(*table(head, [measure(*job)])[2:], sep='\n', flush=True)

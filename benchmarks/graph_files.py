@@ -43,6 +43,7 @@ SHARES = 0.1, 0.3, 0.5
 ORDER = [3, 4, 5, 0, 1, 2]  # rotation first
 CODE = 'stavpr_slam/stavpr_slam/pose_graph'
 VALUES = 'success', 'precision', 'recall', 'seconds'
+Own = tuple[np.ndarray, np.ndarray, list[float]]
 Result = tuple[np.ndarray, np.ndarray | None, list[float]]
 
 
@@ -77,14 +78,14 @@ def false_closures(
     return made
 
 
-def ours(edges: list[Edge]) -> Result:
+def ours(edges: list[Edge]) -> Own:
     """Return the positions (N, 3), which closures are accepted, and times of updates (ms)."""
     graph: PoseGraph = graph_of(edges)
     solved = graph.update(final=True)
     return solved[:, :3, 3], np.array([edge.accepted for edge in graph.edges]), []
 
 
-def one_at_a_time(edges: list[Edge], timed: int | None = None) -> Result:
+def one_at_a_time(edges: list[Edge], timed: int | None = None) -> Own:
     """
     Return the same where closures come with the later one of their nodes, each an update.
 
@@ -173,7 +174,8 @@ def of_gtsam(edges: list[Edge], method: str) -> Result:
     graph.add(gtsam.PriorFactorPose3(0, pose, tight))
     values.insert(0, pose)
     for number, (start, end, motion, information) in enumerate(odometry + closures):
-        model = gtsam.noiseModel.Gaussian.Information(information[np.ix_(ORDER, ORDER)])
+        rotation_first = information[np.ix_(ORDER, ORDER)]
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(rotation_first)
         if number >= len(odometry) and method == 'Cauchy':
             cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(1.0)
             model = gtsam.noiseModel.Robust.Create(cauchy, model)
@@ -283,7 +285,7 @@ def main() -> None:
         solved: list[tuple[list[Edge], np.ndarray]] = []
         for _, method, kind, share in Progress(list(group), desc=name):
             key = {'file': name, 'method': method, 'kind': kind, 'share': share}
-            before = next((row for row in rows if key.items() <= row.items()), {})
+            before: dict[str, Any] = next((row for row in rows if key.items() <= row.items()), {})
             code = version(method)
             if before.get('version') == code and before['runs'] >= options.seeds:
                 continue

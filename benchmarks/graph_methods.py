@@ -41,7 +41,8 @@ NEARBY = np.diag([3.0] * 3 + [np.radians(20)] * 3) ** 2  # of KITTI's closures
 RIGHT = {'kitti': 10.0, 'world': 6.0}  # meters between the images of a right closure
 KITTI = ('00', '05', '06', '08', '09')
 GROUPS = (1, 3, 10, 50, 100, 900)  # closures between two updates
-DRIVES = {  # of a world: factor on the errors of the odometry, and what is special
+# of a world: factor on the errors of the odometry, and what is special
+DRIVES: dict[str, tuple[float, dict[str, Any]]] = {
     'large drift': (1.0, {}), 'small drift': (0.06, {}),
     'sessions': (1.0, {'sessions': 2}), 'carried': (1.0, {'carried': True}),
 }  # fmt: skip
@@ -132,7 +133,8 @@ def with_false_runs(drive: Drive, runs: int, length: int, seed: int) -> Drive:
         for k in range(length):
             ends = query + 2 * k, place + step * k
             if 0 <= ends[1] < ends[0] - 100:
-                closures.append(Closure(*drive.stamps[list(ends)].tolist(), SAME, NEARBY))
+                stamps = int(drive.stamps[ends[0]]), int(drive.stamps[ends[1]])
+                closures.append(Closure(*stamps, SAME, NEARBY))
     right = np.append(drive.right, np.zeros(len(closures) - len(drive.closures), bool))
     name = f'{drive.name}, {runs} false runs of {length}, draw {seed}'
     return replace(drive, name=name, closures=closures, right=right)
@@ -151,10 +153,11 @@ def worlds(seed: int, draw: int, folder: Path) -> Iterator[Drive]:
                 places = false_places.FalsePlaces(share, coherent, 100 * seed + draw)
                 used: set[int] = set()
                 closures, ends = [], []
-                for match in (match for match in pairs if match.closure is not None):
+                edges = ((each, each.closure) for each in pairs if each.closure is not None)
+                for match, closure in edges:
                     used |= {match.query, match.place}
                     place = places.place(match.place, used)
-                    closures.append(replace(match.closure, place_stamp=int(drive.stamps[place])))
+                    closures.append(replace(closure, place_stamp=int(drive.stamps[place])))
                     ends.append((match.query, place, match.place))
             query, place, measured = np.array(ends).T
             away = np.linalg.norm(drive.truth[query, :2] - drive.truth[place, :2], axis=1)
@@ -260,7 +263,8 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
     deviations = np.repeat([SIGMAS.rotation, SIGMAS.translation], 3)
     for i, (a, b) in enumerate(pairwise(poses)):
         length = max(float(np.linalg.norm(T[i + 1, :3, 3] - T[i, :3, 3])), 0.05)
-        model = gtsam.noiseModel.Diagonal.Sigmas(deviations * np.sqrt(length))
+        spread = deviations * np.sqrt(length)
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(spread)
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, a.between(b), model))
     indices = list(range(graph.size()))
     for closure in drive.closures:
@@ -356,8 +360,8 @@ def main() -> None:
     parser.add_argument('--noise', action='store_true', help='odometries of other errors alone')
     options = parser.parse_args()
     if options.noise:
-        jobs = product(ODOMETRIES, FALSE_IN_RUNS, FACTORS)
-        rows = [driven(circle(kind, factor, share), 10) for kind, share, factor in jobs]
+        cases = product(ODOMETRIES, FALSE_IN_RUNS, FACTORS)
+        rows = [driven(circle(kind, factor, share), 10) for kind, share, factor in cases]
         write_json(RESULTS / 'graph_noise.json', {'about': environment(), 'rows': rows})
         print('\n'.join(f'{row["drive"]}: {row["odometry"]} -> {row["error"]}' for row in rows))
         print('most above the odometry on the way:', max(row['above'] for row in rows), 'm')

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.features.registry import Cells
-from stavpr_ros.method.cells import FEW, SIDE
-from stavpr_ros.method.model import MODEL
+from stavpr_ros.method.cells import SIDE
+from stavpr_ros.method.model import FEW, MODEL
 
 ITEM_BYTES = {'float32': 4, 'int8': 1}
 

@@ -29,7 +29,7 @@ MAPPED = re.compile(r'[0-9a-f]+-[0-9a-f]+ \S+ \S+ \S+ (\d+) *(.*)')
 
 
 def mapped(pid: int) -> Counter[str]:
-    """Return the proportional set of a process by library, heap and other memory, MB."""
+    """Return the proportional set of a process by library, heap and other memory, kB."""
     sizes: Counter[str] = Counter()
     name = ''
     for line in Path(f'/proc/{pid}/smaps').read_text().splitlines():
@@ -37,7 +37,7 @@ def mapped(pid: int) -> Counter[str]:
             file = Path(match[2]).name
             name = (file.split('.')[0] if int(match[1]) else match[2]) or 'arenas, arrays, kernels'
         elif line.startswith('Pss:'):
-            sizes[name] += int(line.split()[1]) / 1024
+            sizes[name] += int(line.split()[1])
     return sizes
 
 
@@ -63,7 +63,7 @@ def measure(features: str, places: int, images: int, folder: Path) -> dict[str, 
             'features': features, 'places': places, 'images': figures['processed'],
             'rss_mb': memory(node), 'pss_mb': proportional_memory(node),
             'threads': len(os.listdir(f'/proc/{node}/task')),
-            'mapped_mb': dict(mapped(node).most_common(LARGEST)),
+            'mapped_mb': {of: kB / 1024 for of, kB in mapped(node).most_common(LARGEST)},
         }  # fmt: skip
 
 

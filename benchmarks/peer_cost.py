@@ -54,7 +54,7 @@ class Drive(NamedTuple):
     @classmethod
     def of_source(cls, source: Any) -> 'Drive':
         """Return the images of a source."""
-        images, orb = [frame.image for frame in source], cv2.ORB_create(ORB_FEATURES)
+        images, orb = [frame.image for frame in source], cv2.ORB.create(ORB_FEATURES)
         descriptors = [orb.detectAndCompute(image, None)[1] for image in images]
         assert all(d is not None for d in descriptors)
         features = FeatureExtractor('gradient').extract(images)
@@ -152,7 +152,7 @@ def methods(places: Drive, query: Drive) -> dict[str, Method]:
 
 def time_features(images: list[np.ndarray]) -> dict[str, float]:
     """Return the milliseconds that the features of an image take, by the method or the kind."""
-    orb, settings, views = cv2.ORB_create(ORB_FEATURES), SeqSlamSettings(), cycle(images)
+    orb, settings, views = cv2.ORB.create(ORB_FEATURES), SeqSlamSettings(), cycle(images)
     gradient, network = (FeatureExtractor(kind) for kind in ('gradient', NETWORK))
     jobs = {
         'ORB': timed_job(lambda: orb.detectAndCompute(next(views), None)),

@@ -28,7 +28,7 @@ from stavpr_lab.evaluation.seqslam import match_differences, SeqSlamSettings
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, Map, select_places
 from stavpr_ros.method import RecognizerSettings
-from stavpr_ros.sources import open_source
+from stavpr_ros.sources.folder import FolderSource
 import torch
 
 LENGTH = 20  # images in a window, our default; seqNet has 5, pySeqSLAM 10
@@ -68,7 +68,7 @@ def pyseqslam(folder: Path, D: np.ndarray, length: int) -> Matches:
     :param D: distances of places and images, shape (n, N).
     """
     sys.path.insert(0, str(folder / 'pyseqslam'))
-    np.infty = np.inf
+    vars(np)['infty'] = np.inf
     parameters = load(folder / 'pyseqslam/parameters.py').defaultParameters()
     matching, contrast = parameters.matching, parameters.contrastEnhancement
     matching.ds, matching.Rwindow = Whole(length), Whole(matching.Rwindow)
@@ -133,8 +133,8 @@ def methods(
             match_differences(differences(places, queries).T, settings),
         )
     for mode in ('paper', 'robust'):
-        settings = RecognizerSettings(mode=mode)
-        results = evaluate_on_map(place_map, query.features, truth, settings).results
+        ours = evaluate_on_map(place_map, query.features, truth, RecognizerSettings(mode=mode))
+        results = ours.results
         if mode == 'paper':
             yield 'ours, aligned single images', (results.single.best, results.single.scores)
         yield f'ours, mode {mode}, l = 20', (results.sequence.best, results.sequence.scores)
@@ -167,10 +167,9 @@ def measure(options: Any) -> Iterator[tuple[str, str, str, dict[str, float]]]:
     """Yield features, case, method and numbers."""
     folder = data_folder()
     metrics = load(options.vpr_tutorial / 'evaluation/metrics.py')
-    nordland = [open_source(folder / 'nordland_64x32' / name) for name in ('summer', 'winter')]
-    for source in nordland:
-        source.files = source.files[:PLACES]
-    cases = [*short_cases(folder), Case('nordland', *nordland, identity(3))]
+    summer, winter = (FolderSource(folder / 'nordland_64x32' / n) for n in ('summer', 'winter'))
+    summer.files, winter.files = summer.files[:PLACES], winter.files[:PLACES]
+    cases = [*short_cases(folder), Case('nordland', summer, winter, identity(3))]
     for feature in ('g',) if options.quick else ('g', 'o'):
         extractor = extractors(feature, folder)['robust']
         if feature == 'o':

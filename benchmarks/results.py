@@ -131,7 +131,7 @@ def heading(title: str, command: str, about: dict[str, Any]) -> list[str]:
         for name, value in (about['machine'] | {'instruction_sets': sets}).items()
         if value != ''
     }
-    machine, versions = (
+    hardware, software = (
         ', '.join(f'{name} {value}' for name, value in of.items())
         for of in (machine, about['versions'])
     )
@@ -140,8 +140,8 @@ def heading(title: str, command: str, about: dict[str, Any]) -> list[str]:
         '',
         f'Written by `{command}`; benchmarks/README.md describes the method.',
         f'Commit {about["commit"]}, {about["date"]}.',
-        *textwrap.wrap(f'Machine: {machine}.', 120),
-        *textwrap.wrap(f'Versions: {versions}.', 120),
+        *textwrap.wrap(f'Machine: {hardware}.', 120),
+        *textwrap.wrap(f'Versions: {software}.', 120),
         '',
     ]
 

@@ -81,7 +81,7 @@ class Run:
         )
         bound, extra = bound_seconds(works, self.peaks), {'cells': cells} if cells else {}
         summary = own.median_s, own.spread_s, own.runs, bound, times, extra
-        self.rows.append(Row(stage, mode, *size, precision, *summary))
+        self.rows.append(Row(stage, mode, size[0], size[1], precision, *summary))
         self._bar.update()
 
     def skip(self, name: str, n: int, d: int, reason: str) -> None:

@@ -57,8 +57,8 @@ class Session:
     def part(self, images: slice) -> 'Session':
         """Return some of the images."""
         numbers = np.arange(len(self.drive))[images]
-        parts = (select_places(drive, numbers) for drive in (self.drive, self.mirrored))
-        return Session(*parts, self.position[images])
+        drive, mirrored = (select_places(each, numbers) for each in (self.drive, self.mirrored))
+        return Session(drive, mirrored, self.position[images])
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,9 @@ def routes(folder: Path) -> Iterator[Route]:
     one, two, three, four = (day.part(slice(a, a + LAP)) for day in days for a in (0, LAP))
     orders = (one, two, three, four), (one, three, two, four), (three, four, one, two)
     yield Route('office, 3 orders', 5, orders, LAP)
-    lap = session('running_track/lap1')
-    other = session('running_track/lap2', lap.drive)
-    yield Route('track', 10, [(lap, other.part(even), other.part(odd))])
+    track = session('running_track/lap1')
+    other = session('running_track/lap2', track.drive)
+    yield Route('track', 10, [(track, other.part(even), other.part(odd))])
 
 
 def measure(

@@ -133,6 +133,7 @@ def paper_stages(run: Run, n: int) -> None:
     select = partial(best_match, matches, NMS_RADIUS)
     add('selection', call=select, works=[bounds.selection(sizes)])
     nearest = select()
+    assert nearest is not None
     trace = partial(trace_sequence, padded[:, :n], nearest.first, SEQUENCE.k)
     width = min(n - nearest.first, SEQUENCE.k)
     add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
@@ -142,7 +143,7 @@ def sequence_peers(run: Run, window: np.ndarray, ours: SequenceDistances) -> lis
     """Return the peers of LM-DTW on the same window; their results must be ours."""
     peers = [_prange_peer(window, ours)]
     try:
-        from librosa.sequence import dtw  # type: ignore[import-not-found]
+        from librosa.sequence import dtw
     except ImportError:
         run.skip('librosa', 0, 0, 'not installed (requirements/bench.txt)')
         return peers
@@ -246,7 +247,7 @@ def feature_stages(run: Run, n: int, d: int) -> None:
         peers = references(run, places, queries[:1], precision)
         matcher = make_matcher(places, SPATIAL, 'cpu', precision)
         first = np.ascontiguousarray(queries.strips[:, 0])
-        call = partial(matcher.distances, first, queries.weights[:, 0])
+        call: Call = partial(matcher.distances, first, queries.weights[:, 0])
         works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
         run.measure('image_distances', size, call, works, peers, precision)
         if n <= MATRIX_PLACES:
@@ -286,7 +287,7 @@ def city_stages(run: Run, n: int, d: int) -> None:
     """Measure the image distances of a map in int8."""
     from stavpr_ros.prepare.matcher import CpuMatcher
 
-    rounded = Int8Strips(STRIPS, n, d)
+    rounded: Any = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
         block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, low)
         rounded[:, low:] = block.strips
@@ -311,8 +312,8 @@ def process_stages(run: Run, n: int, precision: str) -> None:
         return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVE_IMAGES:,} places')
     extractor, d = FeatureExtractor('gradient', projection=PROJECTED), PROJECTED
     images = np.random.default_rng(0).integers(0, 256, (DRIVE_IMAGES, 48, 64, 3), np.uint8)
-    driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, 0)
-    strips = strips.strips
+    driven = extractor.extract(list(images))
+    strips = make_features(n, d, STRIPS, 0).strips
     strips *= d**0.5 * driven.strips.std(axis=1, keepdims=True)
     strips += driven.strips.mean(axis=1, keepdims=True)
     normalize(strips)
@@ -365,7 +366,7 @@ def references(
 
 def faiss_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     """Return FAISS as a peer of the product: whole images as vectors, the nearest one of all."""
-    import faiss  # type: ignore[import-not-found]
+    import faiss
 
     index = faiss.IndexFlatIP(images.shape[1])
     index.add(images)
@@ -375,7 +376,7 @@ def faiss_peer(images: np.ndarray, image: np.ndarray) -> Peer:
 
 def usearch_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     """Return usearch as a peer of the product in int8: whole images as vectors, the nearest."""
-    from usearch.index import MetricKind, search  # type: ignore[import-not-found]
+    from usearch.index import MetricKind, search
 
     vectors, query = (
         np.rint(rows / np.abs(rows).max(axis=1, keepdims=True) * 127).astype(np.int8)
