@@ -10,7 +10,6 @@ together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000`` 
 ``benchmarks/results/city.json``, and writes results/city.md from it.
 """
 
-import argparse
 from collections.abc import Iterator
 import json
 import os
@@ -20,7 +19,7 @@ from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import commit, cpu_model, RESULTS, table, write_json, write_lines
+from results import commit, cpu_model, parser_of, RESULTS, table, write_json, write_lines
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -209,7 +208,7 @@ def write_page(results: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument('--places', type=int, nargs='+', default=[100_000], metavar='N')
     parser.add_argument('--cases', nargs='+', choices=CASES, default=list(CASES))
     parser.add_argument('--pca', type=int, default=0, metavar='D', help='as map compact --pca')

@@ -25,8 +25,8 @@ import time
 from typing import Any
 
 import numpy as np
+from results import parser_of, ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 STRIPS, LENGTH, QUERIES = 7, 20, 1000
 DIMENSIONS = 224  # of features whose cells are compared
 MAX_LINES = 5  # differences of a stream
@@ -181,7 +181,7 @@ def compare_answers(other: Path) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; 1 if this checkout is slower than allowed, or answers differ."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument('checkout', type=Path, help='folder of the other checkout')
     parser.add_argument('--answers', action='store_true', help='compare these, and no times')
     parser.add_argument(

@@ -23,7 +23,7 @@ import tempfile
 import time
 from typing import Any
 
-from results import table
+from results import parser_of, table
 from soak import about, HEIGHT, image_message, make_map, memory, publish, texture_route, WIDTH
 
 WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
@@ -302,9 +302,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument('--rates', type=float, nargs='*', default=[10, 30], help='images/s')
     parser.add_argument('--seconds', type=float, default=25, help='of each rate (%(default)s)')
     parser.add_argument('--map', help='instead of one of 2000 synthetic places')
@@ -313,6 +311,10 @@ def main() -> None:
     parser.add_argument('--stages', nargs=3, help=argparse.SUPPRESS)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
+    if arguments.seconds <= SETTLED:
+        parser.error(
+            f'--seconds {arguments.seconds:g} must exceed {SETTLED:g}, which do not count'
+        )
     from stavpr_ros.threads import wait_passively
 
     wait_passively()

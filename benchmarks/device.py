@@ -12,18 +12,17 @@ from torch's profiler. Operations and their bytes are counted as torch dispatche
 each reads and writes, as if nothing stayed in a cache.
 """
 
-import argparse
 from itertools import cycle
 import json
 from pathlib import Path
 import platform
-import subprocess
 import sys
 import time
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from results import commit, parser_of
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
@@ -178,7 +177,7 @@ def compare_answers(
 
 def main() -> int:
     """Measure all cases."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser = parser_of(__doc__)
     add = parser.add_argument
     add('--device', default='cuda', help='of torch (%(default)s)')
     add('--places', type=int, nargs='+', default=[2_000, 100_000, 1_000_000])
@@ -186,12 +185,10 @@ def main() -> int:
     options = parser.parse_args()
     is_cuda = options.device.startswith('cuda')
     backend = options.device if is_cuda else torch.device(options.device)
-    command = ['git', 'rev-parse', '--short', 'HEAD']
-    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     result: dict[str, Any] = {
         'device': torch.cuda.get_device_name() if is_cuda else platform.processor(),
         'torch': torch.__version__,
-        'commit': commit,
+        'commit': commit(),
         'command': 'python benchmarks/device.py ' + ' '.join(sys.argv[1:]),
         'images': IMAGES,
         'cases': [],

@@ -8,13 +8,13 @@ them: each a walk of 500 places, a mean of the features of two of the traverses,
 and direction each, at random speeds of 0.5 to 2, with their strips shifted sideways, unit norm.
 """
 
-import argparse
 from pathlib import Path
 import tempfile
 import time
 
 from data import data_folder
 import numpy as np
+from results import parser_of
 from stavpr_fleet import FleetRecognizer, open_city_map, upload
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, descriptor_map, Map
@@ -101,7 +101,7 @@ def run(
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument('--places', type=int, nargs='+', default=[20_000])
     parser.add_argument('--homes', nargs='+', default=['faiss', 'qdrant'])
     arguments = parser.parse_args()

@@ -14,6 +14,7 @@ import tempfile
 
 from data import data_folder
 import numpy as np
+from results import parser_of
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, merge_maps, save_map
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
@@ -51,6 +52,7 @@ def drive(
 
 def main() -> None:
     """Print the table."""
+    parser_of(__doc__).parse_args()
     floors = sorted(path for path in (data_folder() / 'tower').iterdir() if path.is_dir())
     columns = ['floor', 'images', 'matched', 'right floor, of these', 'most probable floor right']
     columns += ['images until a match', 'with `~/reset`: matched', 'right floor']

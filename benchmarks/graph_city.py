@@ -7,14 +7,13 @@ False closures are drawn as in ``graph_files.py``. Prints recall, the false clos
 accepted, the absolute trajectory error after rigid alignment, processor time and memory.
 """
 
-import argparse
 from itertools import product
 import resource
 import time
 
 from graph_files import ate, false_closures, ours
 import numpy as np
-from results import commit, cpu_model, table
+from results import commit, cpu_model, parser_of, table
 from scipy.spatial import KDTree
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_slam.pose_graph.g2o import Edge, OUT_OF_PLANE
@@ -75,7 +74,7 @@ def measure(nodes: int, kind: str, share: float, seed: int) -> list[str]:
 
 def main() -> None:
     """Measure and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument('--nodes', type=int, nargs='+', default=[1000, 3000, 10000])
     parser.add_argument('--kinds', nargs='+', default=['random', 'grouped'])
     parser.add_argument('--shares', type=float, nargs='+', default=[0.1, 0.3, 0.5])

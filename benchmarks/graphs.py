@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import fields
 import json
 from pathlib import Path
-import sys
 
 from matplotlib.axes import Axes
-from results import Row
+from results import parser_of, Row
 from stavpr_lab.style import legend_above, page
 from stavpr_ros.palette import BLUE, GRAY, ORANGE
 
@@ -61,8 +60,15 @@ def _draw_stage(axes: Axes, own: Sequence[Row]) -> None:
             axes.plot(*zip(*peers, strict=True), style, color=GRAY, ms=5, label=name)
 
 
+def main() -> None:
+    """Draw written results."""
+    parser = parser_of(__doc__)
+    parser.add_argument('results', type=Path, help='JSON file of matching.py')
+    parser.add_argument('graph', type=Path, help='PNG file to write')
+    options = parser.parse_args()
+    rows, names = json.loads(options.results.read_text())['rows'], [f.name for f in fields(Row)]
+    draw([Row(**{name: row[name] for name in names}) for row in rows], options.graph)
+
+
 if __name__ == '__main__':
-    document = json.loads(Path(sys.argv[1]).read_text())
-    names = [field.name for field in fields(Row)]
-    results = [Row(**{name: row[name] for name in names}) for row in document['rows']]
-    draw(results, Path(sys.argv[2]))
+    main()

@@ -11,13 +11,13 @@ from functools import partial
 from itertools import product
 import json
 from pathlib import Path
-import sys
 import time
 
 import cv2
 from data import data_folder
 import numpy as np
 import onnx
+from results import parser_of
 from stavpr_ros.features import efficientnet_lite_file as lite
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, MEAN, STD
@@ -82,7 +82,9 @@ def seconds_of(extractor: FeatureExtractor, image: np.ndarray) -> float:
 
 def main() -> None:
     """Write the table, if asked to; print the comparison."""
-    if '--scales' in sys.argv:
+    parser = parser_of(__doc__)
+    parser.add_argument('--scales', action='store_true', help='measure and write these first')
+    if parser.parse_args().scales:
         write_scales()
     networks = {name: EfficientNetLite1(EfficientNetSettings(model=name)) for name in lite.FILES}
     for name in LEFT_OUT:

@@ -19,7 +19,7 @@ import tempfile
 from typing import Any
 
 from cost import process, proportional_memory, SUBSCRIBER
-from results import table
+from results import parser_of, table
 from soak import about, image_message, make_map, memory, publish, texture_route
 
 CASES = (2000, 400), (300, 1000)  # places, images
@@ -69,9 +69,7 @@ def measure(features: str, places: int, images: int, folder: Path) -> dict[str, 
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     kinds = 'gradient', 'hybrid'
     parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
     parser.add_argument('--output', help='write the figures to this JSON file as well')

@@ -3,7 +3,7 @@
 """
 Heading and lateral offset of a camera that drives beside the taught path, against the truth.
 
-``python benchmarks/offset_lateral.py [SEED ...]``: 50 m of the synthetic street taught by day with
+``python benchmarks/offset_lateral.py``: 50 m of the synthetic street taught by day with
 0.5 m between the images, and driven in parallel, by day, at dusk and in rain; the camera turns by
 up to 3 degrees, and its distance from the path changes by 0.15 m. A second table has ``~/pose`` of
 the same drives up to 0.4 m beside the path: its error across the path.
@@ -12,10 +12,10 @@ the same drives up to 0.4 m beside the path: its error across the path.
 from collections.abc import Iterator
 from dataclasses import replace
 import math
-import sys
 from typing import Any
 
 import numpy as np
+from results import parser_of
 from stavpr_lab.demonstration.repeat import CONDITIONS, Taught, teach, View
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
@@ -100,9 +100,11 @@ def pose_row(taught: Taught, seed: int) -> str:
     )
 
 
-def main() -> int:
+def main() -> None:
     """Run the command."""
-    seeds = [int(seed) for seed in sys.argv[1:]] or SEEDS
+    parser = parser_of(__doc__)
+    parser.add_argument('seeds', type=int, nargs='*', default=SEEDS, help='of the streets')
+    seeds = parser.parse_args().seeds
     total, lines, poses = len(seeds) * len(LEFT) * len(CONDITIONS) * len(WITHIN), [], []
     with Progress(total=total, unit='image') as progress:
         for seed in seeds:
@@ -115,8 +117,7 @@ def main() -> int:
     print('\n| street | matched | RMS across the path | largest | deviation | within 2 |')
     print('|---|---|---|---|---|---|')
     print('\n'.join(poses))
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

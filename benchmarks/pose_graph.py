@@ -7,7 +7,6 @@ Before the timed updates the graph grows in larger steps; the timed ones add one
 With ``--plot``, also of city-like graphs (``graph_city.py``), 30 % of whose closures are false.
 """
 
-import argparse
 from itertools import product
 from pathlib import Path
 import time
@@ -15,7 +14,7 @@ import time
 from graph_city import city
 from graph_files import false_closures, one_at_a_time
 import numpy as np
-from results import commit, cpu_model
+from results import commit, cpu_model, parser_of
 from stavpr_lab.demonstration.simulated_odometry import add_drift
 from stavpr_lab.style import DASHES, legend_above, page
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
@@ -87,7 +86,7 @@ def draw(path: Path, times: dict[str, dict[int, np.ndarray]]) -> None:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument('--nodes', type=int, nargs='+', default=[1000, 3000, 10000])
     parser.add_argument('--updates', type=int, default=200, help='that are timed (%(default)s)')
     parser.add_argument('--drift', type=float, default=0.06, help='of the odometry (%(default)s)')

@@ -152,9 +152,15 @@ def file_name(machine: dict[str, Any]) -> str:
     return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
 
 
+def parser_of(document: str | None) -> argparse.ArgumentParser:
+    """Return a parser whose help begins with the docstring of a program."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(description=document, formatter_class=formatter)
+
+
 def options_parser(document: str | None, quick: str) -> argparse.ArgumentParser:
     """Return a parser with the common options of the commands that write a report."""
-    parser = argparse.ArgumentParser(description=(document or '').strip().splitlines()[0])
+    parser = parser_of(document)
     add = parser.add_argument
     add('--quick', action='store_true', help=quick)
     add('--commit', default='', help='name of the measured commit, outside a git checkout')

@@ -14,7 +14,7 @@ import time
 
 from data import data_folder
 import numpy as np
-from results import RESULTS, table, write_lines
+from results import parser_of, RESULTS, table, write_lines
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.same_places import with_last_related
@@ -207,6 +207,7 @@ def update(place_map: Map, drive: Map, version: Version, name: str) -> tuple[Map
 
 def main() -> None:
     """Write the rows, with each route those so far."""
+    parser_of(__doc__).parse_args()
     limit_threads(1)
     listed = list(routes(data_folder()))
     others = [route.orders[0][0].drive for route in [*listed[2:], *listed[:2]]]

@@ -7,7 +7,6 @@ Each drive is recognized from its images with the odometry of its draw, the edge
 and the graph is solved. Writes benchmarks/results/slam.md.
 """
 
-import argparse
 from collections.abc import Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
 from dataclasses import replace
@@ -20,7 +19,7 @@ import time
 from typing import Any
 
 import numpy as np
-from results import environment, RESULTS, write_lines
+from results import environment, parser_of, RESULTS, write_lines
 from scipy.spatial.transform import Rotation
 from slam_page import markdown, NEAR
 from slam_pairs import CAMERA, Found, measured, recognized, SharedViews, with_edges
@@ -260,7 +259,7 @@ def measure_world(seed: int, draws: int, folder: Path, parts: Path) -> int:
 
 def main() -> None:
     """Measure and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument('--seeds', type=int, nargs='+', default=[41, 42, 43, 44, 45])
     parser.add_argument('--draws', type=int, default=5, help='of the odometry (%(default)s)')
     parser.add_argument('--jobs', type=int, default=1, help='processes (%(default)s)')

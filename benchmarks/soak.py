@@ -21,7 +21,7 @@ import time
 from typing import Any
 
 import numpy as np
-from results import commit, cpu_model, versions
+from results import commit, cpu_model, parser_of, versions
 
 PLACES, WIDTH, HEIGHT = 2000, 640, 480
 STEP = 41  # pixels from one view to the next
@@ -195,9 +195,7 @@ def about(load: float) -> dict[str, Any]:
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument('--seconds', type=float, default=300)
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
     parser.add_argument('--map', help=f'instead of one of {PLACES} synthetic places')

@@ -8,7 +8,6 @@ Warm: a second start. Run it where the package is built and sourced: ``make shel
 ``python benchmarks/start.py``.
 """
 
-import argparse
 from collections import Counter
 import json
 import os
@@ -21,7 +20,7 @@ import time
 from typing import Any
 
 from cost import process, seconds_of
-from results import table
+from results import parser_of, table
 from soak import about, image_message, make_map, memory, texture_route
 
 RATE, IMAGES = 10.0, 30  # images per second, and how many after the node has subscribed
@@ -88,9 +87,7 @@ def start(path: str, kernels: str) -> dict[str, Any]:
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from stavpr_lab.demonstration.live import executable, private_domain

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from data import data_folder
 import numpy as np
-from stavpr_ros.features import FeatureExtractor
+from results import parser_of
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, extract_features
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
@@ -42,11 +43,11 @@ def placenav(distances: np.ndarray) -> np.ndarray:
     return np.array(places)
 
 
-def ours(recognizer: PlaceRecognizer, queries: object, count: int) -> Iterator[int]:
+def ours(recognizer: PlaceRecognizer, queries: LocalFeatures) -> Iterator[int]:
     """Yield the place of each image; without a match the last one, at first -1."""
     place = -1
-    for i in range(count):
-        match = recognizer.update(queries[i : i + 1])  # type: ignore[index]
+    for i in range(len(queries)):
+        match = recognizer.update(queries[i : i + 1])
         place = match.newest if match.accepted else place
         yield place
 
@@ -64,6 +65,7 @@ def numbers(places: np.ndarray) -> str:
 
 def main() -> None:
     """Print the table."""
+    parser_of(__doc__).parse_args()
     print('| drive | method | right | right, of those with a place | jumps | deviation of steps |')
     print('|---|---|---|---|---|---|')
     for name, folders in CASES.items():
@@ -82,7 +84,7 @@ def main() -> None:
         methods = {
             'nearest image': distances.argmin(axis=1),
             "PlaceNav's filter": placenav(distances),
-            'ours': np.array(list(ours(recognizer, queries, len(queries)))),
+            'ours': np.array(list(ours(recognizer, queries))),
         }
         for method, places in methods.items():
             print(f'| {name} | {method} | {numbers(places)} |')

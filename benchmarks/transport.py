@@ -8,7 +8,6 @@ and to two. Run it where the package is built and sourced: ``make shell``, then
 ``python benchmarks/transport.py``.
 """
 
-import argparse
 import array
 from collections.abc import Iterator
 from contextlib import contextmanager, ExitStack
@@ -22,6 +21,7 @@ import tempfile
 from typing import Any
 
 import cv2
+from results import parser_of
 from soak import about, image_message, make_map, publish, texture_route
 
 SIZES = {'640x480': (640, 480), '1920x1080': (1920, 1080)}
@@ -71,9 +71,7 @@ def row(result: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument('--seconds', type=float, default=8, help='of each case (%(default)s)')
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
     large = 'publish through the Fast DDS profile for large images, as replay does'
