@@ -1,14 +1,17 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks, end to end on tiny sizes: matching, outcomes."""
+"""The benchmarks: matching end to end on tiny sizes, outcomes, pages, options."""
 # ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
-import ast
+from contextlib import redirect_stdout
 from dataclasses import replace
-import importlib
+from functools import cache
+from io import StringIO
 import json
 from pathlib import Path
+import re
 import sys
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -26,6 +29,18 @@ import peaks
 import report
 
 PEAKS = Peaks(1e9, 1e10)
+PROGRAMS = [path.stem for path in BENCHMARKS.glob('*.py') if '__main__' in path.read_text()]
+ROOT = BENCHMARKS.parent
+PAGES = sorted(
+    path for pages in ('*.md', 'docs/**/*.md', 'benchmarks/**/*.md') for path in ROOT.glob(pages)
+)
+RECIPE = re.compile(r'^([\w-]+):.*\n((?:\t.*\n)+)', re.MULTILINE)
+TARGETS = {
+    target: re.findall(r'benchmarks/(\w+)\.py', recipe)
+    for target, recipe in RECIPE.findall((ROOT / 'Makefile').read_text())
+}
+OPTION = re.compile(r'(?<![\w-])--[a-z][a-z-]*')
+OWN = re.compile(r'^--|^ARGS|^make |\.py')  # not code of other commands
 
 
 @pytest.mark.slow
@@ -97,16 +112,28 @@ def test_public_graph_one_closure_at_a_time_ends_like_all_at_once():
     assert len(times) == 30
 
 
-def test_benchmarks_import_only_what_the_packages_have():
-    """Also of those whose own packages, such as gtsam, are not installed here."""
-    missing = []
-    for path in sorted(BENCHMARKS.glob('*.py')):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('stavpr_'):
-                module = importlib.import_module(node.module)
-                for name in (alias.name for alias in node.names):
-                    try:
-                        hasattr(module, name) or importlib.import_module(f'{node.module}.{name}')
-                    except ImportError:
-                        missing.append(f'{path.name}: {node.module}.{name}')
-    assert not missing
+@cache
+def usage_of(name: str) -> str:
+    """Return the usage that a program prints, which runs in this process."""
+    module, output = pytest.importorskip(name, exc_type=ModuleNotFoundError), StringIO()
+    arguments = patch.object(sys, 'argv', [name, '--help'])
+    with arguments, redirect_stdout(output), pytest.raises(SystemExit, match=r'^0$'):
+        module.main()
+    return output.getvalue().partition('\n\n')[0]
+
+
+@pytest.mark.parametrize('name', PROGRAMS)
+def test_program_prints_its_help(name):
+    assert usage_of(name).startswith(f'usage: {name} [-h]')
+
+
+@pytest.mark.parametrize('page', [ROOT / 'Makefile', *PAGES], ids=lambda page: page.name)
+def test_page_names_programs_and_options_that_there_are(page):
+    """The options of a line are those of its programs, and of those that its targets run."""
+    for line in page.read_text().splitlines():
+        assert {*re.findall(r'benchmarks/(\w+)\.py', line)} <= {*PROGRAMS}, line
+        names = {*re.findall(r'(?<![\w/])(?:benchmarks/)?(\w+)\.py', line)} & {*PROGRAMS}
+        names.update(*(TARGETS.get(target, ()) for target in re.findall(r'make ([\w-]+)', line)))
+        spans = [span for span in line.split('`')[1::2] or [line] if OWN.search(span)]
+        if names and (options := {*OPTION.findall(' '.join(spans))}):
+            assert options <= {*OPTION.findall(' '.join(map(usage_of, names)))}, line
