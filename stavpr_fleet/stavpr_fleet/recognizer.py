@@ -47,9 +47,10 @@ class CityLayout(ColumnLayout):
     Columns for places of a city, with a gap between runs of neighboring ones.
 
     :param places: ascending, (m,).
-    :param firsts: position of the first place of each run.
-    :param same_as: position of the same place, for each.
+    :param firsts, same_as: positions of the first place of each run, and of each same place.
     """
+
+    names_places = True
 
     def __init__(
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
@@ -328,8 +329,7 @@ class FleetRecognizer(SequenceRecognizer):
         if not len(places):
             return
         firsts = _firsts(places, self._city.store.index.runs(places))
-        same_as = np.searchsorted(places, self._same_as[self._order])
-        same_as = np.minimum(same_as, len(places) - 1)
+        same_as = np.minimum(places.searchsorted(self._same_as[self._order]), len(places) - 1)
         here = places[same_as] == self._same_as[self._order]
         same_as = np.where(here, same_as, np.arange(len(places)))
         layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)

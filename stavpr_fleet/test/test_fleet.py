@@ -16,6 +16,7 @@ from robot import image_message
 from stavpr_fleet import CityMap, FleetRecognizer, open_city_map, upload
 from stavpr_fleet.neighborhoods import Votes
 from stavpr_fleet.qdrant_store import EdgePoints
+from stavpr_fleet.recognizer import CityLayout
 from stavpr_fleet.store import map_vectors, MapIndex, place_vectors
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
@@ -27,6 +28,7 @@ from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.localizer import EARLY
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.prepare.centering import unit_norm
 
@@ -147,6 +149,15 @@ def test_votes_follow_the_speed():
         votes.add(image, np.array([*wrong, 1000 + 2 * image, -1]))
     assert abs(votes.best(1)[0] - 1018) <= 8
     assert Votes(5, (1.0,)).best(3).tolist() == []
+
+
+def test_matches_in_a_single_neighborhood_number_places_of_the_city():
+    layout = CityLayout(np.arange(928, 1024), np.zeros(1, np.int64), np.arange(96), 20)
+    pairs = np.array([[0, 20], [1, 21]], np.int32)
+    match = WindowMatch(Path(pairs, 20), WindowSequences)
+    result = layout.in_places(match).path
+    assert (result.place, result.pairs[:, 1].tolist()) == (948, [948, 949])
+    assert layout.session_of(948) == (928, 1024)
 
 
 @pytest.mark.parametrize('store', ['memory', 'faiss'])

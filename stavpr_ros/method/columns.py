@@ -42,8 +42,7 @@ class ColumnLayout:
 
     :param firsts: first place of every run of places of one session, ascending, (m,); the first
         one is 0. One session: each place is the column of its number.
-    :param same_as: for each place, itself, or the place of an earlier session that shows the
-        same, (n,); not needed for one session.
+    :param same_as: of each place, itself or the one of an earlier session that shows it, (n,).
     :param nms_radius: places that are at most so many positions apart are neighbors. A gap has
         more columns, and more than a camera moves from image to image.
     :param against: the camera may move against the map, too; not without places.
@@ -51,9 +50,10 @@ class ColumnLayout:
 
     ``starts`` are the first places of the sessions, ``columns`` the columns of the places along
     the map and, behind these, of the others, None where each place is the column of its number,
-    and ``gaps`` the columns between.
-    ``lap`` is the number of places of a closed route's lap, 0 of another route.
+    and ``gaps`` the columns between. ``lap``: places of a closed route's lap, 0 of another route.
     """
+
+    names_places = False  # with one session, too, matches number places otherwise than columns
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class ColumnLayout:
     ) -> None:
         self.starts, self.nms_radius, self.lap, self.gaps = firsts, nms_radius, 0, NO_PLACES
         self.columns: np.ndarray | None = None
-        if len(firsts) == 1 and not against and not repeated:
+        if len(firsts) == 1 and not (against or repeated or self.names_places):
             return
         n = self._n = len(same_as)
         self.lap = n - int(same_as[-1]) - 1 if repeated else 0
