@@ -30,7 +30,6 @@ RULES = {  # fields of KeyframeSettings
     'angle': ('DEG', 'degrees from the last place; needs --odometry or --poses'),
     'change': ('C', 'change of the image, 0 to 2; a camera at rest stays below 0.004'),
 }
-MAX_SUGGESTED = 20_000  # places of a map whose threshold and seam are sought
 
 EPILOG = """
 examples:
@@ -265,9 +264,10 @@ def _source_of(arguments: argparse.Namespace) -> str:
 def _suggest_threshold(place_map: 'Map', arguments: argparse.Namespace) -> 'float | None':
     """Return the threshold of mode paper for a map; None where the map is too short for one."""
     from stavpr_ros.errors import InputError
+    from stavpr_ros.maintenance.same_places import MAX_PLACES
     from stavpr_ros.maintenance.threshold import suggest_threshold
 
-    if len(place_map) > MAX_SUGGESTED:
+    if len(place_map) > MAX_PLACES:
         return None  # it would take the whole map into memory
     model = getattr(arguments, f'{place_map.settings.kind}_model', None) or ''
     try:
@@ -318,18 +318,14 @@ def main(args: list[str] | None = None) -> int:
         if len(arguments.input) > 1:
             return _build_each(arguments, sys.argv[1:] if args is None else args)
         arguments.input = arguments.input[0]
-        from stavpr_ros.maintenance.same_places import with_laps, with_seam
+        from stavpr_ros.maintenance.same_places import with_repeats
         from stavpr_ros.mapping import save_map
         from stavpr_ros.prepare.prepared_map import statistics_of_map
 
         state = 'nothing was written; the same command continues the work'
         place_map, journal = _build(arguments)
-        is_small = len(place_map) <= MAX_SUGGESTED
-        if is_small:
-            place_map = with_laps(place_map)
+        place_map = with_repeats(place_map)
         place_map = replace(place_map, threshold=_suggest_threshold(place_map, arguments))
-        if is_small:
-            place_map = with_seam(place_map)
         statistics = statistics_of_map(place_map)
         save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
         journal.unlink()

@@ -3,7 +3,8 @@
 """
 Relates places to earlier ones with the same view, by recognition.
 
-A session is related to the sessions before it, and the end of a closed route to its start.
+A session is related to the sessions before it, and the end of a closed route to its start. A
+recording of several laps is divided into a session for each.
 """
 
 from dataclasses import replace
@@ -23,6 +24,8 @@ from stavpr_ros.progress import Progress
 SURE = 0.9  # probability above which two places are taken to be the same
 RELATED = 0.5  # part of the places of later laps that is related to earlier ones
 MAX_END = 60  # last places of a route, which are compared with its first ones
+PROBES = 16  # runs of MAX_END images that show whether a recording has laps
+MAX_PLACES = 20_000  # of a map whose laps and seam are sought
 
 
 class SamePlaces:
@@ -54,9 +57,31 @@ class SamePlaces:
         return np.where(self.middles >= 0, self.middles, self._near)
 
 
+def with_repeats(place_map: Map) -> Map:
+    """
+    Return the map after a recording, which is its last session, with what that repeats related.
+
+    A map of one session is closed (:func:`with_seam`) or has a session for each lap
+    (:func:`with_laps`). Of another map, the last session is divided into laps. Where nothing is
+    repeated, or of more than ``MAX_PLACES`` places, the map is returned as it is.
+    """
+    index, number = place_map.session_index, len(place_map.sessions) - 1
+    if len(place_map) > MAX_PLACES:
+        return place_map
+    if index is None or number < 1:
+        divided = with_laps(place_map)
+        closed = with_seam(place_map) if len(divided.sessions) < 3 else divided
+        return divided if closed.seam is None else closed
+    recording = select_places(place_map, np.flatnonzero(index == number))
+    if (divided := with_laps(recording)) is recording:
+        return place_map
+    earlier = select_places(place_map, np.flatnonzero(index < number))
+    return with_same_places(merge_maps([earlier, divided], ['', '']), number)
+
+
 def with_last_related(place_map: Map) -> Map:
-    """Return the map with the places of its last session related, as by with_same_places."""
-    return with_same_places(place_map, len(place_map.sessions) - 1)
+    """Return the map with the places of its last session related, and its laps divided."""
+    return with_repeats(with_same_places(place_map, len(place_map.sessions) - 1))
 
 
 def with_same_places(place_map: Map, first: int = 1) -> Map:
@@ -152,16 +177,26 @@ def with_laps(place_map: Map) -> Map:
     Return the map of a recording of several laps with a session for each; another map as it is.
 
     Its places are driven, as a query of mode robust, on its first third: a lap begins where these
-    are matched again. Most places of the later laps must be matched to earlier ones.
+    are matched again. Most places of the later laps must be matched to earlier ones. Where no run
+    of a sample is matched, the others are not driven.
     """
-    n, bounds = len(place_map), [0]
+    n, bounds, length = len(place_map), [0], SequenceSettings().length
     if len(place_map.sessions) > 1 or n <= 3 * MAX_END:
         return place_map
-    images = np.arange(MAX_END, n)
-    matched = recognize_places(select_places(place_map, np.arange(n // 3)), place_map, images)
-    begins = (images - matched)[matched >= 0]
+    reference = select_places(place_map, np.arange(n // 3))
+
+    def begins_of(images: np.ndarray) -> np.ndarray:
+        matched = recognize_places(reference, place_map, images)
+        # the images behind the reference may look like its last places
+        return (images - matched)[(matched >= 0) & (matched < n // 3 - length)]
+
+    firsts = np.linspace(n // 3, n - MAX_END, PROBES).astype(np.int64)
+    sample = np.add.outer(firsts, np.arange(MAX_END)).ravel()
+    if len(sample) < n / 2 and (begins_of(sample) <= MAX_END).all():
+        return place_map
+    begins = begins_of(np.arange(MAX_END, n))
     for begin in begins[begins < n - MAX_END].tolist():
-        is_sure = (abs(begins - begin) < MAX_END // 2).sum() > SequenceSettings().length
+        is_sure = (abs(begins - begin) < MAX_END // 2).sum() > length
         shortest = bounds[1] // 2 if len(bounds) > 1 else MAX_END
         if is_sure and begin > bounds[-1] + shortest:
             bounds.append(begin)

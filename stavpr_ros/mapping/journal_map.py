@@ -134,7 +134,8 @@ def recover(
         base, problem = _base_map(reader.base)
         if base is not None:
             sessions = reader.template.sessions
-            place_map = relate(_append(base, place_map, reader.base, sessions))
+            place_map = _append(base, place_map, reader.base, sessions)
+        place_map = relate(place_map)
         if output is None:
             target = _save_beside(place_map, target)
         else:

@@ -185,7 +185,7 @@ class Map:
         **options: Any,
     ) -> 'Map':
         """
-        Make a map of the images of a route, a place each.
+        Make a map of the images of a route, a place each; each of several laps is a session.
 
         :param source: path of a folder of images, a video or a bag; :func:`stavpr_ros.images` of
             it, which has options; or RGB arrays (h, w, 3), uint8.
@@ -195,6 +195,7 @@ class Map:
         :raises InputError: no images, or an item that is no image, and how to convert it.
         :raises SourceError: the source cannot be read, or has no images.
         """
+        from stavpr_ros.maintenance.same_places import with_repeats
         from stavpr_ros.mapping.builder import build_map
 
         kinds = (str, FeatureSettings, FeatureExtractor)
@@ -204,7 +205,7 @@ class Map:
         elif isinstance(features, str):
             features = FeatureExtractor(features)
         frames: Any = open_source(source) if isinstance(source, (str, Path)) else source
-        return build_map(frames, features, **options)
+        return with_repeats(build_map(frames, features, **options))
 
     @staticmethod
     def load(path: str | Path) -> 'Map':

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.maintenance.same_places import with_repeats
 from stavpr_ros.mapping import GrowingMap, load_map, Map, merge_maps, open_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.stored_features import StoredFeatures
@@ -180,6 +181,8 @@ class Pipeline:
             place_map, extractor = loaded.places, loaded.extractor
             base = Base.of(loaded.path, loaded.places.stamps)
             state = SaveState(loaded.path, base, open_journal=self._open_journal)
+        elif name == 'localization' and isinstance(self.places, GrowingMap) and place_map:
+            place_map = with_repeats(place_map)
         is_route, before = name == 'loop_closure', {self.save_state, self._map_save_state}
         new_state = SaveState(open_journal=self._open_journal) if is_route else state
         self.operation = CLASSES[name](settings, place_map, extractor, new_state)

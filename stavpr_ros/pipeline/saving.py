@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Saving a recorded map while images are processed; files of other maps are never overwritten."""
 
+from contextlib import suppress
 from logging import Logger
 from pathlib import Path
 from typing import Any
 
 from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
-from stavpr_ros.maintenance.same_places import with_last_related
+from stavpr_ros.maintenance.same_places import with_last_related, with_repeats
 from stavpr_ros.mapping import Map, save_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
-from stavpr_ros.output_file import Force, MAP, numbered_names, require_replaceable
+from stavpr_ros.output_file import FileVersion, Force, MAP, numbered_names, require_replaceable
 from stavpr_ros.pipeline.drives import OnWorker, take_up_drives, write_drives
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
@@ -22,6 +23,9 @@ def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: For
     """
     Write the map of the pipeline to a file, on this thread; return its number of places.
 
+    A recording that repeats its route is written once more, with its laps divided or its seam,
+    which takes long to find: what ends the program meanwhile leaves the map of one session.
+
     :param on_worker: calls a function on the thread of the pipeline.
     :raises StavprError: no places, an existing file, or a file that cannot be written.
     """
@@ -29,8 +33,13 @@ def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: For
     snapshot = on_worker(pipeline.snapshot)
     places = snapshot.places
     save_map(places, path, force=overwrite, statistics=statistics_of_map(places))
+    written = FileVersion.of(path)
     on_worker(lambda: snapshot.mark_saved(path))
-    return len(snapshot.places)
+    if snapshot.recorded and (repeats := with_repeats(places)) is not places:
+        with suppress(OutputTakenError):  # a later save was faster
+            save_map(repeats, path, force=written or False, statistics=statistics_of_map(repeats))
+            on_worker(lambda: snapshot.state.own(path))
+    return len(places)
 
 
 def update_own_map(pipeline: Pipeline, on_worker: OnWorker, log: 'Logger | Any') -> int:

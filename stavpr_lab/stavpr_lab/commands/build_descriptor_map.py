@@ -47,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
 def _build(arguments: argparse.Namespace) -> None:
     from stavpr_lab.commands.evaluate_sequences import poses_of
     from stavpr_lab.features.descriptors import read_descriptors
+    from stavpr_ros.maintenance.same_places import with_repeats
     from stavpr_ros.mapping import descriptor_map, save_map
     from stavpr_ros.output_file import MAP, require_replaceable
     from stavpr_ros.prepare.prepared_map import statistics_of_map
@@ -57,6 +58,7 @@ def _build(arguments: argparse.Namespace) -> None:
     if arguments.poses is not None:
         poses = poses_of(arguments.poses, place_map, 'map', None)
         place_map = replace(place_map, poses=poses)
+    place_map = with_repeats(place_map)
     statistics = statistics_of_map(place_map)
     save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'

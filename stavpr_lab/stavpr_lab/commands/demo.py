@@ -259,12 +259,13 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.plots import draw_result
     from stavpr_lab.evaluation.records import evaluate_records
     from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.maintenance.same_places import with_repeats
     from stavpr_ros.mapping import build_map, save_map
 
     pair = _traverse_pair(arguments, folder)
     length, map_path = arguments.sequence_length, folder / 'map.stavpr'
     _print(f'2. The map of the first traverse: {map_path}')
-    place_map = build_map(pair.reference.open(_skip), make_extractor(arguments))
+    place_map = with_repeats(build_map(pair.reference.open(_skip), make_extractor(arguments)))
     save_map(place_map, map_path, force=True)
     threshold = _threshold(place_map, arguments)
 

@@ -20,6 +20,7 @@ from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.errors import left_out, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import AUTO
+from stavpr_ros.maintenance.same_places import with_repeats
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, Map, select_places
 from stavpr_ros.mapping.builder import fit_value_range
 from stavpr_ros.mapping.merging import along_route
@@ -78,6 +79,8 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
             for name, path in sorted(paths.items(), key=_decides_features)
             if path is not None
         }
+        if 'map' in inputs and not is_saved_map(arguments.map):
+            inputs['map'] = with_repeats(inputs['map'])
         sequences = _of_paths(arguments, inputs, loader.times)
     if unread := left_out(loader.left_out):
         print(unread, file=sys.stderr)
@@ -291,7 +294,8 @@ def _ground_truth(
     if arguments.truth is None:
         return GroundTruth.unknown(N, n)
     if arguments.truth == 'identity':
-        return GroundTruth.identity(N, n, tolerance)
+        same = GroundTruth.identity(N, n)
+        return same.widened(tolerance, along_route(reference)[0])
     if arguments.truth != 'poses':
         truth = GroundTruth.from_file(arguments.truth, N, n, names=(query.ids, reference.ids))
         return truth.widened(tolerance, along_route(reference)[0])
