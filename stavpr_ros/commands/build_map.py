@@ -56,58 +56,29 @@ def _parser() -> argparse.ArgumentParser:
     parser = make_parser(
         'build_map', 'Build a reference map: one place for each image or keyframe.', EPILOG
     )
-    parser.add_argument(
-        '--input',
-        required=True,
-        nargs='+',
-        metavar='FOLDER|VIDEO|BAG',
-        help='images, a video, a ROS 1 or ROS 2 bag; each of several becomes a map',
-    )
-    parser.add_argument(
-        '--output',
-        required=True,
-        metavar='MAP',
-        help='the file to write; for several inputs the folder of the maps',
-    )
-    parser.add_argument('--force', action='store_true', help='replace an existing map')
-    parser.add_argument('--topic', help='image topic of the bag, if it has several')
+    add = parser.add_argument
+    text = 'images, a video, a ROS 1 or ROS 2 bag; each of several becomes a map'
+    add('--input', required=True, nargs='+', metavar='FOLDER|VIDEO|BAG', help=text)
+    text = 'the file to write; for several inputs the folder of the maps'
+    add('--output', required=True, metavar='MAP', help=text)
+    add('--force', action='store_true', help='replace an existing map')
+    add('--topic', help='image topic of the bag, if it has several')
     add_camera(parser)
     add_fps(parser)
-    parser.add_argument(
-        '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
-    )
-    parser.add_argument(
-        '--poses',
-        metavar='CSV',
-        help='poses of the images, a line each, in their order or with their names: x y z, '
-        'x y z qx qy qz qw, TUM or KITTI (meters, quaternion)',
-    )
-    parser.add_argument(
-        '--odometry',
-        metavar='TOPIC',
-        help='take the poses of the places from this nav_msgs/Odometry of the bag',
-    )
-    parser.add_argument(
-        '--no-thumbnails', action='store_true', help='keep no thumbnails of the places'
-    )
-    parser.add_argument(
-        '--thumbnail-width',
-        type=int,
-        metavar='PX',
-        help='width of the thumbnails (192); larger ones do not help the geometric check',
-    )
-    parser.add_argument(
-        '--skip-bad-images',
-        action='store_true',
-        help='continue after an image that cannot be read',
-    )
-    parser.add_argument(
-        '--panorama-yaw',
-        type=float,
-        default=0.0,
-        metavar='DEG',
-        help='turn 360-degree images to the left; 180: as the robot takes them on its return',
-    )
+    text = 'take every N-th image (%(default)s)'
+    add('--every', type=int, default=1, metavar='N', help=text)
+    text = 'poses of the images, a line each, in their order or with their names: x y z, '
+    text += 'x y z qx qy qz qw, TUM or KITTI (meters, quaternion)'
+    add('--poses', metavar='CSV', help=text)
+    text = 'take the poses of the places from this nav_msgs/Odometry of the bag'
+    add('--odometry', metavar='TOPIC', help=text)
+    add('--no-thumbnails', action='store_true', help='keep no thumbnails of the places')
+    text = 'width of the thumbnails (192); larger ones do not help the geometric check'
+    add('--thumbnail-width', type=int, metavar='PX', help=text)
+    text = 'continue after an image that cannot be read'
+    add('--skip-bad-images', action='store_true', help=text)
+    text = 'turn 360-degree images to the left; 180: as the robot takes them on its return'
+    add('--panorama-yaw', type=float, default=0.0, metavar='DEG', help=text)
     group = parser.add_argument_group(
         'keyframes',
         'Only images that differ enough from the last place become places. All rules must be\n'

@@ -223,80 +223,38 @@ def _parser() -> argparse.ArgumentParser:
         'Publish images of a bag, video or folder, at a pace or after the last result.',
         EPILOG,
     )
-    parser.add_argument(
-        'bag',
-        metavar='BAG',
-        help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, a video, or a folder of '
-        'images',
-    )
-    parser.add_argument('--topic', help='image topic in the bag; needed if it has several')
+    add = parser.add_argument
+    text = 'a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, a video, or a folder of images'
+    add('bag', metavar='BAG', help=text)
+    add('--topic', help='image topic in the bag; needed if it has several')
     add_camera(parser)
-    parser.add_argument(
-        '--odometry',
-        nargs='?',
-        const=ONLY,
-        metavar='TOPIC',
-        help='publish this topic of nav_msgs/Odometry, by default the only one, on odom',
+    text = 'publish this topic of nav_msgs/Odometry, by default the only one, on odom'
+    add('--odometry', nargs='?', const=ONLY, metavar='TOPIC', help=text)
+    text = 'publish these topics under their names; without a name: all (cameras, tf, ...)'
+    add('--also', nargs='*', metavar='TOPIC', help=text)
+    add_pace = parser.add_mutually_exclusive_group().add_argument
+    text = 'factor on the recorded pace (1)'
+    add_pace('--rate', type=positive, default=1.0, metavar='R', help=text)
+    text = 'send each image after the result of the last one'
+    add_pace('--lossless', action='store_true', help=text)
+    text = f'images per second that a folder was recorded with ({FOLDER_FPS:g}), or to take from'
+    add('--fps', type=positive, metavar='HZ', help=f'{text} a video (5)')
+    text = 'write the matches, as `record`; --lossless misses none'
+    add('--record', metavar='FILE', help=text)
+    add('--force', action='store_true', help='replace an earlier --record FILE')
+    add('--loop', action='store_true', help='start again at the end')
+    text = 'start so many recorded seconds after the beginning'
+    add('--start-offset', type=_not_negative, default=0.0, metavar='S', help=text)
+    text = 'end after so many recorded seconds'
+    add('--duration', type=positive, default=math.inf, metavar='S', help=text)
+    text = f'publish the recorded time on /clock for use_sim_time ({CLOCK_RATE:g} Hz)'
+    add(
+        '--clock', nargs='?', type=positive, const=CLOCK_RATE, default=0.0, metavar='HZ', help=text
     )
-    parser.add_argument(
-        '--also',
-        nargs='*',
-        metavar='TOPIC',
-        help='publish these topics under their names; without a name: all (cameras, tf, ...)',
-    )
-    pace = parser.add_mutually_exclusive_group()
-    pace.add_argument(
-        '--rate', type=positive, default=1.0, metavar='R', help='factor on the recorded pace (1)'
-    )
-    pace.add_argument(
-        '--lossless', action='store_true', help='send each image after the result of the last one'
-    )
-    parser.add_argument(
-        '--fps',
-        type=positive,
-        metavar='HZ',
-        help=f'images per second that a folder was recorded with ({FOLDER_FPS:g}), or to take '
-        'from a video (5)',
-    )
-    parser.add_argument(
-        '--record', metavar='FILE', help='write the matches, as `record`; --lossless misses none'
-    )
-    parser.add_argument('--force', action='store_true', help='replace an earlier --record FILE')
-    parser.add_argument('--loop', action='store_true', help='start again at the end')
-    parser.add_argument(
-        '--start-offset',
-        type=_not_negative,
-        default=0.0,
-        metavar='S',
-        help='start so many recorded seconds after the beginning',
-    )
-    parser.add_argument(
-        '--duration',
-        type=positive,
-        default=math.inf,
-        metavar='S',
-        help='end after so many recorded seconds',
-    )
-    parser.add_argument(
-        '--clock',
-        nargs='?',
-        type=positive,
-        const=CLOCK_RATE,
-        default=0.0,
-        metavar='HZ',
-        help=f'publish the recorded time on /clock for use_sim_time ({CLOCK_RATE:g} Hz)',
-    )
-    parser.add_argument('--start-paused', dest='paused', action='store_true', help='start paused')
-    parser.add_argument(
-        '--timeout',
-        type=positive,
-        default=20.0,
-        metavar='S',
-        help='seconds without a result until an image is sent again; 3 tries (%(default)g)',
-    )
-    parser.add_argument(
-        '--wait', type=positive, metavar='S', help='seconds to wait for a subscriber'
-    )
+    add('--start-paused', dest='paused', action='store_true', help='start paused')
+    text = 'seconds without a result until an image is sent again; 3 tries (%(default)g)'
+    add('--timeout', type=positive, default=20.0, metavar='S', help=text)
+    add('--wait', type=positive, metavar='S', help='seconds to wait for a subscriber')
     return parser
 
 
