@@ -248,13 +248,13 @@ def _suggest_threshold(place_map: 'Map', arguments: argparse.Namespace) -> 'floa
 
 
 def _report(place_map: 'Map', output: str) -> None:
+    from stavpr_ros.maintenance.same_places import repeats_of
+
     megabytes = Path(output).stat().st_size / 1e6
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
     say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
-    if laps := len(place_map.sessions):
-        say(f'the recording repeats its route: {laps} laps became a session each')
-    if place_map.seam is not None:
-        say(f'the route is closed: its last place shows place {place_map.seam}')
+    if text := repeats_of(place_map):
+        say(text)
 
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:

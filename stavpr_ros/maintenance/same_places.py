@@ -79,6 +79,14 @@ def with_repeats(place_map: Map) -> Map:
     return with_same_places(merge_maps([earlier, divided], ['', '']), number)
 
 
+def repeats_of(place_map: Map) -> str:
+    """Return in a sentence what :func:`with_repeats` made of a map without sessions."""
+    if place_map.seam is not None:
+        return f'the route is closed: its last place shows place {place_map.seam}'
+    laps = len(place_map.sessions)
+    return f'the recording repeats its route: {laps} laps became a session each' if laps else ''
+
+
 def with_last_related(place_map: Map) -> Map:
     """Return the map with the places of its last session related, and its laps divided."""
     return with_repeats(with_same_places(place_map, len(place_map.sessions) - 1))

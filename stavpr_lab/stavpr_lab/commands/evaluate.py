@@ -168,11 +168,8 @@ def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('ground truth').add_argument
     add('--truth', metavar='identity|poses|FILE', help='see below')
     add('--tolerance', type=int, metavar='T', help='places that a correct match may be off')
-    add(
-        '--query-poses',
-        metavar='CSV',
-        help='x y z [qx qy qz qw], TUM or KITTI, of each query image',
-    )
+    query_poses = 'x y z [qx qy qz qw], TUM or KITTI, of each query image'
+    add('--query-poses', metavar='CSV', help=query_poses)
     add('--map-poses', metavar='CSV', help="the same of every place (the saved map's)")
     add('--meters', type=float, default=5.0, help='with poses: largest distance (%(default)g)')
     add('--degrees', type=float, help='with poses that have orientations: largest angle (any)')

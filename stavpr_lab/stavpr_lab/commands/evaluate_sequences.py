@@ -20,7 +20,7 @@ from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.errors import left_out, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import AUTO
-from stavpr_ros.maintenance.same_places import with_repeats
+from stavpr_ros.maintenance.same_places import repeats_of, with_repeats
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, Map, select_places
 from stavpr_ros.mapping.builder import fit_value_range
 from stavpr_ros.mapping.merging import along_route
@@ -81,6 +81,8 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
         }
         if 'map' in inputs and not is_saved_map(arguments.map):
             inputs['map'] = with_repeats(inputs['map'])
+            if note := repeats_of(inputs['map']):
+                print(note, file=sys.stderr)
         sequences = _of_paths(arguments, inputs, loader.times)
     if unread := left_out(loader.left_out):
         print(unread, file=sys.stderr)

@@ -34,9 +34,8 @@ def main(args: list[str] | None = None) -> int:
         published = [kind for kind in kinds() if settings_class(kind) is PublishedSettings]
         names = [CONVERTED, *published]
         parser.add_argument('features', choices=names, help='kind of features')
-        parser.add_argument(
-            '--sha256', default='', help='hash of the file, 64 digits; known for vgg16'
-        )
+        text = 'hash of the file, 64 digits; known for vgg16'
+        parser.add_argument('--sha256', default='', help=text)
         arguments = parser.parse_args(args)
         if arguments.features == CONVERTED:
             if arguments.sha256:
