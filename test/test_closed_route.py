@@ -14,7 +14,8 @@ from stavpr_ros.commands import build_map
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.maintenance.same_places import with_laps, with_seam
+from stavpr_ros.maintenance import same_places
+from stavpr_ros.maintenance.same_places import with_laps, with_repeats, with_seam
 from stavpr_ros.mapping import load_map, merge_maps, save_map, select_places
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.settings import RobustOptions
@@ -211,6 +212,45 @@ def test_routes_without_laps_stay_as_they_are(repeats, open_map):
         strips[:, 230:280] = strips[:, 100:150]
     place_map = open_map if repeats == 'the start' else map_of(features_of(strips, 0.6, 1))
     assert with_laps(place_map) is place_map
+
+
+def test_long_recording_is_sought_for_laps_in_a_sample(set_constants):
+    set_constants(same_places, PROBES=2, MAX_PLACES=3 * LAP)
+    recording = map_of(laps(0, 3 * LAP, 0.6, 1))
+    assert len(with_repeats(recording).sessions) == 3
+    set_constants(same_places, PROBES=0)
+    assert with_laps(recording) is recording
+    long_map = map_of(laps(0, 3 * LAP + 1, 0.6, 1))
+    assert with_repeats(long_map) is long_map
+
+
+def test_images_like_the_end_of_the_first_third_begin_no_lap(monkeypatch):
+    """As in a street: they are matched with places near that end."""
+    recognize_places = same_places.recognize_places
+
+    def alike(reference, drive, images):
+        is_alike = (len(reference) == 200) & (images > 265) & (images < 300)
+        return np.where(is_alike, 190, recognize_places(reference, drive, images))
+
+    monkeypatch.setattr(same_places, 'recognize_places', alike)
+    divided = with_laps(map_of(features_of(np.tile(route_strips(0, 300), (1, 2, 1)), 0.6, 1)))
+    assert abs(divided.session_index.tolist().index(1) - 300) <= 2
+
+
+def test_lap_and_its_repeated_start_are_a_closed_route():
+    """A second lap that is short becomes no session: recognition goes on over the seam."""
+    assert with_laps(recording := map_of(laps(0, LAP + 75, 0.6, 1))).sessions
+    assert (with_repeats(recording).seam, with_repeats(recording).sessions) == (74, ())
+
+
+def test_laps_of_a_session_on_another_map_are_divided():
+    recording, query = map_of(laps(0, 2 * LAP, 0.6, 1)), laps(60, LAP + 60, 0.8, 2)
+    both = merge_maps([map_of(view(7, 0.6)), recording], ['street', 'recorded-1'])
+    divided = with_repeats(both)
+    assert [session.id for session in divided.sessions] == ['street', 'recorded-1', 'recorded-1-2']
+    accepted = [sum(m.accepted for m in recognize(x, query, LAP_FORWARD)) for x in (divided, both)]
+    assert accepted[0] > 90 > 2 * accepted[1]
+    assert with_repeats(divided) is divided
 
 
 def test_route_may_be_stated_to_be_closed():

@@ -2,16 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded map is saved at the end, and no other file is overwritten; the folder of maps."""
 
+from functools import partial
 from pathlib import Path
 
+from fixtures import route_images
+import numpy as np
 from pipelines import localizing, Log, process, save, settings_of
 import pytest
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import load_map, open_map, save_map
+from stavpr_ros.mapping import load_map, open_map, save_map, select_places
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.output_file import FileVersion
-from stavpr_ros.pipeline import Pipeline, read_map
+from stavpr_ros.pipeline import Pipeline, read_map, saving
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
-from stavpr_ros.pipeline.saving import save_recorded_map, write_map
+from stavpr_ros.pipeline.saving import recover_maps, save_recorded_map, write_map
 from stavpr_ros.prepare import prepared_map
 
 
@@ -62,6 +66,41 @@ def test_save_recorded_map_after_a_backup_overwrites_its_own_file(small_map, rou
     save(pipeline, tmp_path / 'backup.stavpr')
     process(pipeline, route[:2])
     assert at_the_end(pipeline, path)[-1] == ('info', f'62 places written to {path}')
+
+
+@pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
+def test_two_recorded_laps_become_a_session_each(operation, tmp_path):
+    """In the file, as the map of localization, and after a crash; a loaded map is copied."""
+    path, killed = tmp_path / 'laps.stavpr', tmp_path / 'killed.stavpr'
+    open_journal = partial(JournalWriter.create, killed, log=print)
+    pipeline, laps = Pipeline(settings_of(), operation, open_journal), 2 * route_images(95)
+    process(pipeline, laps)
+    save_map(pipeline.snapshot().places, tmp_path / 'plain.stavpr')
+    save(pipeline, path)
+    process(pipeline, laps[:2], 190)
+    assert at_the_end(pipeline, path)[-1] == ('info', f'192 places written to {path}')
+    process(pipeline, laps[2:3], 192)
+    pipeline.change(operation='localization')
+    pipeline.close_journals(delete_route=False)
+    recovered = load_map(recover_maps(killed, Log()))
+    for place_map in (load_map(path), pipeline.places, recovered):
+        assert len(place_map.sessions) == 2
+        assert abs(place_map.session_index.tolist().index(1) - 95) <= 2
+    save(localizing(str(tmp_path / 'plain.stavpr')), tmp_path / 'copy.stavpr')
+    assert not load_map(tmp_path / 'copy.stavpr').sessions
+
+
+def test_save_during_the_search_for_laps_stays(mapping, tmp_path, monkeypatch):
+    path = tmp_path / 'route.stavpr'
+
+    def divide(places):
+        monkeypatch.undo()
+        save(mapping, path, overwrite=True)
+        return select_places(places, np.arange(3))
+
+    monkeypatch.setattr(saving, 'with_repeats', divide)
+    save(mapping, path)
+    assert len(load_map(path)) == 7
 
 
 def test_save_recorded_map_that_fails_logs_the_loss(mapping, tmp_path):

@@ -17,7 +17,8 @@ from fixtures import route_images
 import numpy as np
 import pytest
 from scores import best_f1
-from stavpr_lab.commands import build_descriptor_map, evaluate
+from stavpr_lab.commands import build_descriptor_map, demo, evaluate
+from stavpr_lab.demonstration import live
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.features.descriptors import read_descriptors
@@ -100,6 +101,27 @@ def test_truth_of_one_session_counts_matches_of_every_session(folders, numbers, 
     options = '--query', folders / 'shifted', '--truth', tmp_path / 'pairs.csv', '--tolerance', 2
     decision = numbers('--map', tmp_path / 'both.stavpr', *options)['decision']
     assert (decision['matched_with_truth'], decision['wrongly_matched']) == (12, 0)
+
+
+def test_commands_divide_two_laps_into_sessions(run, runner, tmp_path, monkeypatch):
+    """Of images and descriptors; the same image of both drives is of one position."""
+    images = write_images(tmp_path / 'laps', 2 * route_images(95))
+    vectors, saved = tmp_path / 'laps.npy', tmp_path / 'laps.stavpr'
+    np.save(vectors, np.tile(np.random.default_rng(0).normal(size=(95, 24)), (2, 1)))
+    source = ['--descriptors-source', 'netvlad']
+    for path, options in ((images, ['--features', 'gradient']), (vectors, source)):
+        pair = '--map', path, '--query', path, '--truth', 'identity', *options
+        code, _, errors = run(*pair, '--json', tmp_path / 'a.json', '--force')
+        assert (code, '2 laps became a session each' in errors) == (0, True), errors
+        decision = json.loads((tmp_path / 'a.json').read_text())['decision']
+        assert decision['matched'] > 150 > decision['wrongly_matched'] == 0
+    assert runner(build_descriptor_map)('--input', vectors, '--output', saved, *source)[0] == 0
+    monkeypatch.setattr(live, 'run_live', None)  # it comes after the map
+    pair = '--map', images, '--query', images
+    with pytest.raises(TypeError):
+        runner(demo)(*pair, '--output', tmp_path / 'demo', '--features', 'gradient')
+    for path in (saved, tmp_path / 'demo' / 'map.stavpr'):
+        assert len(load_map(path).sessions) == 2
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):

@@ -168,7 +168,8 @@ def _base_map(base: Base) -> tuple[Map | None, str]:
 def _append(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, ...]) -> Map:
     """Return a map with the recorded places behind it; opened: the map when they began."""
     growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
-    if sessions:
+    # a recording that had no sessions goes on in the last lap of what was saved of it
+    if sessions := sessions or base.sessions[-1:]:
         growing.begin_session(Path(opened.path).stem, sessions[0].id)
     # a map that was saved just before the end has the first places of its journal already
     stamps = base.stamps[opened.places : opened.places + n]

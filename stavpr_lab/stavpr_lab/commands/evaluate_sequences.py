@@ -296,8 +296,8 @@ def _ground_truth(
     if arguments.truth is None:
         return GroundTruth.unknown(N, n)
     if arguments.truth == 'identity':
-        same = GroundTruth.identity(N, n)
-        return same.widened(tolerance, along_route(reference)[0])
+        truth = GroundTruth.identity(N, n)
+        return truth.widened(tolerance, along_route(reference)[0])
     if arguments.truth != 'poses':
         truth = GroundTruth.from_file(arguments.truth, N, n, names=(query.ids, reference.ids))
         return truth.widened(tolerance, along_route(reference)[0])

@@ -57,8 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--commit', default='', metavar='SHA', help='commit of a repository on GitHub, 40 digits')
     add('--entry', required=True, metavar='NAME', help='function in hubconf.py')
     text = 'argument of the entry: fc_output_dim=512, backbone=\'"ResNet18"\'; may be repeated'
-    kind = {'action': 'append', 'type': _argument, 'metavar': 'NAME=JSON'}
-    add('--argument', default=[], help=text, **kind)
+    add('--argument', action='append', type=_argument, default=[], metavar='NAME=JSON', help=text)
     add('--allow-foreign-code', action='store_true', help='run the repository')
     add = parser.add_argument_group('outputs').add_argument
     add('--size', type=int, default=224, help='side of the images in pixels (%(default)s)')
