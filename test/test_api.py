@@ -111,11 +111,6 @@ def test_map_is_made_of_any_iterable_of_images(form, tmp_path):
     assert (loaded.map_id, loaded.ids) == (identity, route.ids)
 
 
-def test_each_of_two_laps_of_images_is_a_session():
-    laps = stavpr.Map.from_images(2 * route_images(95), 'gradient', progress=False)
-    assert [session.id for session in laps.sessions] == ['lap 1', 'lap 2']
-
-
 def test_images_carry_stamp_and_name_into_their_parts(tmp_path):
     image = [*stavpr.images(bag(tmp_path / 'bag', ROUTE[:2]))][1]
     assert (image.stamp, image[::2].stamp, image.copy().name) == (2 * 10**9, 2 * 10**9, '/image#1')

@@ -71,36 +71,33 @@ def test_save_recorded_map_after_a_backup_overwrites_its_own_file(small_map, rou
 @pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
 def test_two_recorded_laps_become_a_session_each(operation, tmp_path):
     """In the file, as the map of localization, and after a crash; a loaded map is copied."""
-    path, killed = tmp_path / 'laps.stavpr', tmp_path / 'killed.stavpr'
+    path, plain, killed = (tmp_path / f'{name}.stavpr' for name in ('laps', 'plain', 'killed'))
     open_journal = partial(JournalWriter.create, killed, log=print)
     pipeline, laps = Pipeline(settings_of(), operation, open_journal), 2 * route_images(95)
     process(pipeline, laps)
-    save_map(pipeline.snapshot().places, tmp_path / 'plain.stavpr')
+    save_map(pipeline.snapshot().places, plain)
     save(pipeline, path)
     process(pipeline, laps[:2], 190)
     assert at_the_end(pipeline, path)[-1] == ('info', f'192 places written to {path}')
     process(pipeline, laps[2:3], 192)
     pipeline.change(operation='localization')
     pipeline.close_journals(delete_route=False)
-    recovered = load_map(recover_maps(killed, Log()))
-    for place_map in (load_map(path), pipeline.places, recovered):
-        assert len(place_map.sessions) == 2
-        assert abs(place_map.session_index.tolist().index(1) - 95) <= 2
-    save(localizing(str(tmp_path / 'plain.stavpr')), tmp_path / 'copy.stavpr')
-    assert not load_map(tmp_path / 'copy.stavpr').sessions
+    for places in (load_map(path), pipeline.places, load_map(recover_maps(killed, Log()))):
+        assert abs(places.session_index.tolist().index(1) - 95) <= 2
+        assert len(places.sessions) == 2
+    save(localizing(str(plain)), tmp_path / 'copy')
+    assert not load_map(tmp_path / 'copy').sessions
 
 
 def test_save_during_the_search_for_laps_stays(mapping, tmp_path, monkeypatch):
-    path = tmp_path / 'route.stavpr'
-
     def divide(places):
         monkeypatch.undo()
-        save(mapping, path, overwrite=True)
+        save(mapping, tmp_path / 'map', overwrite=True)
         return select_places(places, np.arange(3))
 
     monkeypatch.setattr(saving, 'with_repeats', divide)
-    save(mapping, path)
-    assert len(load_map(path)) == 7
+    save(mapping, tmp_path / 'map')
+    assert len(load_map(tmp_path / 'map')) == 7
 
 
 def test_save_recorded_map_that_fails_logs_the_loss(mapping, tmp_path):
