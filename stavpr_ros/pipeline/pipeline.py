@@ -181,7 +181,7 @@ class Pipeline:
             place_map, extractor = loaded.places, loaded.extractor
             base = Base.of(loaded.path, loaded.places.stamps)
             state = SaveState(loaded.path, base, open_journal=self._open_journal)
-        elif name == 'localization' and isinstance(self.places, GrowingMap) and place_map:
+        elif name == 'localization' and state.recorded and place_map is not None:
             place_map = with_repeats(place_map)
         is_route, before = name == 'loop_closure', {self.save_state, self._map_save_state}
         new_state = SaveState(open_journal=self._open_journal) if is_route else state
