@@ -12,7 +12,7 @@ from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import blocks, tuning
-from stavpr_slam.pose_graph.blocks import _Blocks as Blocks
+from stavpr_slam.pose_graph.blocks import Blocks
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges, reversed_edge
 from test_pose_graph import error
 

@@ -1,12 +1,12 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Graphs of other programs: closures come in blocks by time, each decided from the last solution.
+Which closures agree: they come in blocks by time, each decided from the last solution.
 
-The odometry goes ahead of the closures, and each closure is an event of its own. One is right if
-that is 20 times as probable as a place anywhere on the map, by the errors of the solution at both
-ends and the part of all closures that are right; it is left out where that is no longer probable.
-The errors that the file states are right up to a factor, which the closures show.
+The odometry goes ahead of the closures. A closure is right if that is 20 times as probable as a
+place anywhere on the map, by the errors of the solution at both ends; it is left out where that is
+no longer probable. In graphs of other programs the part of all closures that are right counts as
+well, and the errors that the file states are right up to a factor, which the closures show.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +16,8 @@ import numpy as np
 from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.pose_graph.network import Network
-from stavpr_slam.pose_graph.sessions import extend, Pair, place, Placement, weak_pairs
-from stavpr_slam.pose_graph.solution import NOTHING, Solution
+from stavpr_slam.pose_graph.network import freedom_of, Network, room
+from stavpr_slam.pose_graph.sessions import extend, Placement
 from stavpr_slam.pose_graph.solver import likelihoods, scale_errors, squares
 
 PASSES = False, True  # over the closures of a block: again for those that agree by now
@@ -82,10 +81,21 @@ class Beliefs:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredSolution(Solution):
-    """The nodes of a graph of another program, and the evidence on its closures."""
+class Consensus:
+    """
+    Closures that agree with the odometry, at some errors of it.
 
+    :param nodes: transforms in the map, (N, 4, 4).
+    :param inliers: which of n closures agree, (n,), bool.
+    """
+
+    nodes: np.ndarray
+    inliers: np.ndarray
     beliefs: Beliefs
+
+
+NOTHING = Consensus(np.zeros((0, 4, 4)), np.zeros(0, bool), Beliefs(0.0, np.zeros((0, 0))))
+"""Of a graph without odometry."""
 
 
 def weights_in_runs(runs: np.ndarray) -> np.ndarray:
@@ -99,75 +109,90 @@ def are_certain(odds: np.ndarray, runs: np.ndarray) -> bool:
     return bool(weights_in_runs(runs) @ odds > tuning.CERTAIN)
 
 
-def decide_in_blocks(
-    chain: KeyframeChain, closures: ClosureArrays, last: Solution
-) -> MeasuredSolution:
+class Blocks:
     """
-    Add new closures to the last solution, in blocks by time.
+    Adds closures to the last ones that agree; ``own`` and ``network`` are of the present block.
 
     :param last: of the first of the closures; :data:`NOTHING` = all are new.
+    :param scales: factors on the errors of the odometry of each robot; None = one on all errors,
+        by the closures.
     """
-    denied = set[Pair]()
-    while True:
-        solution = _Blocks(chain, closures, last, place(chain, closures, denied)).solution()
-        pairs = weak_pairs(chain, closures[solution.accepted], solution.placement)
-        if not pairs:
-            return solution
-        denied |= pairs
-
-
-class _Blocks:
-    """Adds closures in blocks; ``_own`` and ``_network`` are of the present one."""
 
     def __init__(
-        self, chain: KeyframeChain, closures: ClosureArrays, last: Solution, placement: Placement
+        self,
+        chain: KeyframeChain,
+        closures: ClosureArrays,
+        placement: Placement,
+        last: Consensus = NOTHING,
+        scales: np.ndarray | None = None,
     ) -> None:
         self._chain, self._closures, self._placement = chain, closures, placement
+        self._scales, self._freedom = scales, freedom_of(chain)
         self._latest = np.maximum(closures.query, closures.place)
         self._runs = self._latest // tuning.LONGEST  # whose closures may be wrong together
-        self._network = network = Network(chain, placement.initial, closures, placement.links)
-        width = 2 * network.freedom + 1
-        if isinstance(last, MeasuredSolution) and last.beliefs.innovations.shape[1] == width:
-            beliefs = last.beliefs
-        else:  # nothing, or in a plane that the odometry has left
-            last, beliefs = NOTHING, Beliefs(network.room, np.zeros((0, width)))
-        count, old, self._nodes = len(closures), len(last.accepted), last.nodes
+        space, width = room(placement.initial, self._freedom), 2 * self._freedom + 1
+        if last.beliefs.innovations.shape[1] != width:  # nothing, or the odometry left a plane
+            last = replace(NOTHING, beliefs=Beliefs(space, np.zeros((0, width))))
+        count, old, self._nodes = len(closures), len(last.inliers), last.nodes
         self._is_old = np.arange(count) < old
         self._accepted = np.zeros(count, bool)
-        self._accepted[:old] = last.accepted & placement.allowed[:old]
-        self._beliefs = beliefs.resize(network.room, count)
-        self._searches = count > 0 and count >= tuning.SEARCH * beliefs.search_count
+        self._accepted[:old] = last.inliers & placement.allowed[:old]
+        self._beliefs = last.beliefs.resize(space, count)
+        is_enough = count > 0 and count >= tuning.SEARCH * last.beliefs.search_count
+        self._searches = scales is None and is_enough
         if self._searches:
+            network, _ = self._begin(chain, placement.initial, np.arange(count))
             ends = chain.session[closures.query], chain.session[closures.place]
             inside = np.flatnonzero(ends[0] == ends[1])
-            self._set_odometry()
-            network.residuals(self._odometry, network.values(placement.initial))
             rows, new = network.beside_odometry(inside), ~self._is_old[inside]
             self._beliefs.innovations[inside[new]] = rows[new]
             factors = tuning.FACTORS / self._beliefs.factor
             self._beliefs = self._beliefs.search_factor(rows, self._runs[inside], factors)
             self._beliefs = replace(self._beliefs, search_count=count)
 
+    def _begin(
+        self, part: KeyframeChain, nodes: np.ndarray, own: np.ndarray
+    ) -> tuple[Network, np.ndarray]:
+        """
+        Begin a block, and return its network, linearized, and the variables.
+
+        :param own: numbers of all closures up to its end.
+        """
+        links = {  # a session may be tied to a later one
+            node: link if link < len(part) else part.before(node)
+            for node, link in self._placement.links.items()
+            if node < len(part)
+        }
+        self.own, self._robot = own, part.robot
+        self.network = network = Network(
+            part, nodes, self._closures[own], links, self._freedom, self._beliefs.space
+        )
+        self._limit = tuning.TAILS * network.limit
+        self._set_odometry()
+        values = network.values(nodes)
+        network.residuals(self._odometry, values)
+        return network, values
+
     def _set_odometry(self) -> None:
         """Set the information of all factors of the network at the present errors."""
         factor = self._beliefs.factor
-        self._odometry = self._network.odometry(np.full(len(self._chain), factor), factor)
+        stated = np.full(len(self._chain.robots), factor)
+        scales = stated if self._scales is None else self._scales
+        self._odometry = self.network.odometry(scales[self._robot], factor)
 
-    def solution(self) -> MeasuredSolution:
-        """Return the solution with all closures."""
+    def consensus(self) -> Consensus:
+        """Return all closures that agree."""
         count, seen, is_whole = len(self._chain), self._is_old.copy(), not self._is_old.any()
-        step = max(1, count // tuning.BLOCKS)
+        step = max(1, count // (tuning.BLOCKS if self._scales is None else tuning.PARTS))
         for end in (*range(len(self._nodes) + step, count, step), count):
-            part, is_last = self._chain.until(end), is_whole and end == count
+            part, is_last = self._chain.until(end), end == count
             self._nodes = extend(part, self._nodes, self._placement)
             usable = self._placement.allowed & (self._latest < end)
             if (usable & ~seen).any() or is_last:
-                self._decide(part, np.flatnonzero(usable), ~seen[usable], is_last)
+                swaps = is_last and is_whole and self._scales is None
+                self._decide(part, np.flatnonzero(usable), ~seen[usable], swaps)
             seen |= usable
-        scales = np.full(len(self._chain.robots), self._beliefs.factor)
-        return MeasuredSolution(
-            self._nodes, self._accepted, self._accepted, scales, self._placement, self._beliefs
-        )
+        return Consensus(self._nodes, self._accepted, self._beliefs)
 
     def _decide(self, part: KeyframeChain, own: np.ndarray, new: np.ndarray, swaps: bool) -> None:
         """
@@ -177,23 +202,17 @@ class _Blocks:
         :param new: which of them are new, bool.
         :param swaps: leave out weak ones on trial.
         """
-        self._own = own
-        links = {  # a session may be tied to a later one
-            node: link if link < len(part) else part.before(node)
-            for node, link in self._placement.links.items()
-            if node < len(part)
-        }
-        freedom = self._network.freedom
-        self._network = Network(part, self._nodes, self._closures[own], links, freedom)
-        network, limit = self._network, self._network.limit * tuning.TAILS
-        network.limit, network.room = limit, self._beliefs.space
-        values, accepted = network.values(self._nodes), self._accepted[own]
-        self._set_odometry()
-        network.residuals(self._odometry, values)
+        network, values = self._begin(part, self._nodes, own)
+        accepted, joins = self._accepted[own], np.isin(own, self._placement.joins)
+        if (joins & ~accepted).any():  # a session begins where most closures place it
+            accepted = accepted | joins
+            values, _ = network.fit(self._odometry, accepted, values)
+            network.residuals(self._odometry, values)
+            new = (new | network.beside(joins)) & ~accepted
         for again in PASSES:
             rows = self._beliefs.innovations[own]
             if again:
-                new = ~accepted & (squares(rows) <= limit) & (self._beliefs.odds(rows) > 0)
+                new = ~accepted & (squares(rows) <= self._limit) & (self._beliefs.odds(rows) > 0)
             if not new.any():
                 break
             rows[new] = network.innovations(accepted, np.flatnonzero(new))
@@ -206,11 +225,10 @@ class _Blocks:
                 )
                 self._set_odometry()
                 rows = self._beliefs.innovations[own]
-            odds, fits = self._beliefs.odds(rows), new & (squares(rows) <= limit)
+            odds, fits = self._beliefs.odds(rows), new & (squares(rows) <= self._limit)
             likely = np.flatnonzero(fits & (odds > 0))
             together = again and are_certain(odds[likely], self._runs[own[likely]])
             passes = fits & (odds > (0 if together else tuning.CERTAIN))
-            passes |= new & network.new_joins(accepted)
             if not passes.any():
                 continue
             inliers, values = self._drop_improbable(*self._fit(accepted | passes, values))
@@ -223,9 +241,9 @@ class _Blocks:
 
     def _fit(self, chosen: np.ndarray, values: np.ndarray) -> Inliers:
         """Solve for closures, without those that contradict others."""
-        network, odometry = self._network, self._odometry
+        network, odometry = self.network, self._odometry
         values, _ = network.fit(odometry, chosen, values, tuning.FIRST_STEPS)
-        inliers = chosen & (network.residuals(odometry, values) <= network.limit)
+        inliers = chosen & (network.residuals(odometry, values) <= self._limit)
         values, _ = network.fit(odometry, inliers, values)
         return inliers, values
 
@@ -235,12 +253,12 @@ class _Blocks:
 
         A false one may have a small residual: it bends the odometry, and without it is far away.
         """
-        network, rows = self._network, self._beliefs.innovations
+        network, rows = self.network, self._beliefs.innovations
         while inliers.any():
             weak = np.flatnonzero(inliers)
-            weak = weak[np.argsort(self._beliefs.odds(rows[self._own[weak]]))[: tuning.WEAKEST]]
-            rows[self._own[weak]] = network.innovations(inliers, weak)
-            odds = self._beliefs.odds(rows[self._own[weak]])
+            weak = weak[np.argsort(self._beliefs.odds(rows[self.own[weak]]))[: tuning.WEAKEST]]
+            rows[self.own[weak]] = network.innovations(inliers, weak)
+            odds = self._beliefs.odds(rows[self.own[weak]])
             if odds.min() >= 0:
                 break
             inliers = inliers & (np.arange(len(inliers)) != weak[np.argmin(odds)])
@@ -249,9 +267,9 @@ class _Blocks:
 
     def _swap_weak(self, accepted: np.ndarray, values: np.ndarray) -> Inliers:
         """Leave out a weak closure and those beside it, for others, where that is evidence."""
-        network, odometry, numbers = self._network, self._odometry, np.arange(len(accepted))
+        network, odometry, numbers = self.network, self._odometry, np.arange(len(accepted))
         _, evidence = network.fit(odometry, accepted, values)
-        odds = self._beliefs.odds(self._beliefs.innovations[self._own])
+        odds = self._beliefs.odds(self._beliefs.innovations[self.own])
         for weak in np.argsort(np.where(accepted, odds, np.inf))[: tuning.WEAKEST]:
             away = np.abs([ends - ends[weak] for ends in (network.query, network.place)])
             others = away.max(axis=0) >= tuning.LONGEST
@@ -262,7 +280,7 @@ class _Blocks:
                 continue
             trial_values, _ = network.fit(odometry, trial, values)
             rows = network.innovations(trial, new)
-            fits = (squares(rows) <= network.limit) & (self._beliefs.odds(rows) > 0)
+            fits = (squares(rows) <= self._limit) & (self._beliefs.odds(rows) > 0)
             trial |= np.isin(numbers, new[fits])
             trial, trial_values = self._fit(trial, trial_values)
             trial_values, trial_evidence = network.fit(odometry, trial, trial_values)

@@ -6,21 +6,19 @@ import numpy as np
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph import tuning
 from stavpr_slam.pose_graph.closures import ClosureArrays
+from stavpr_slam.pose_graph.decision import Decision
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
-Trial = tuple[np.ndarray, np.ndarray, int]  # a robust solution, see DriveSolution
 
-
-def find(chain: KeyframeChain, trials: list[Trial], closures: ClosureArrays) -> list[int]:
-    """Return the nodes behind breaks for which closures vote, the most of them first."""
-    query, votes = closures.query, dict[int, int]()
-    for nodes, accepted, bend in trials:
-        own = accepted & (bend >= 0) & (chain.session[query] == chain.session[bend])
-        sides = np.flatnonzero(own & (query < bend)), np.flatnonzero(own & (query >= bend))
-        for before, behind in (*_agreeing(chain, nodes, accepted, closures), sides):
-            if min(len(before), len(behind)) >= tuning.SUPPORT:
-                node = _between(chain, query, before, behind)
-                votes[node] = max(votes.get(node, 0), len(behind))
+def find(chain: KeyframeChain, trials: list[Decision], closures: ClosureArrays) -> list[int]:
+    """Return the nodes behind breaks for which closures vote, the most on both sides first."""
+    votes = dict[int, int]()
+    for trial in trials:
+        for before, behind in _agreeing(chain, trial.nodes, trial.inliers, closures):
+            support = min(len(before), len(behind))
+            if support >= tuning.SUPPORT:
+                node = _between(chain, closures.query, before, behind)
+                votes[node] = max(votes.get(node, 0), support)
     return sorted(votes, key=lambda node: -votes[node])
 
 
@@ -42,8 +40,7 @@ def _agreeing(
 
         def most(among: np.ndarray, agree: np.ndarray = agree) -> np.ndarray:
             """Return the rejected closures that agree with most others among them."""
-            result: np.ndarray = (agree[np.argmax(agree @ among * among)] > 0) & among
-            return result
+            return (agree[np.argmax(agree @ among * among)] > 0) & among
 
         free = np.ones(len(own), bool)
         for _ in range(tuning.SETS if len(own) else 0):

@@ -12,13 +12,19 @@ from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks, tuning
-from stavpr_slam.pose_graph.blocks import decide_in_blocks
+from stavpr_slam.pose_graph.blocks import NOTHING
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
-from stavpr_slam.pose_graph.decision import events
+from stavpr_slam.pose_graph.decision import Decision, events
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extend
-from stavpr_slam.pose_graph.solution import decide_anew, DriveSolution, follow, NOTHING, Solution
+from stavpr_slam.pose_graph.solution import (
+    add_closures,
+    EMPTY,
+    Solution,
+    solve_drives,
+    solve_measured,
+)
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
@@ -66,7 +72,7 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._sources: list[Closure] = []  # those between nodes
         self._closures: ClosureArrays = between_nodes([])  # of them
-        self._solution = NOTHING
+        self._solution = EMPTY
         self._searched = 0  # closures of the last search
         self.counts: Counter[str] = Counter()
 
@@ -84,14 +90,6 @@ class PoseGraph:
     def scale(self) -> float:
         """Return the factor on the errors of the odometry that closures have shown, the worst."""
         return float(self.scales.max(initial=tuning.TIGHT))
-
-    @property
-    def refused(self) -> float:
-        """Return the evidence against a correction that is not published; 0 = there is none."""
-        last = self._solution
-        if not isinstance(last, DriveSolution) or last.decision.is_published:
-            return 0.0
-        return -last.decision.evidence
 
     def add_odometry(
         self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
@@ -194,17 +192,17 @@ class PoseGraph:
     def _solve(self, final: bool) -> Solution:
         last, graph = self._solution, (self.chain, self._closures)
         if self.settings.measured:
-            return decide_in_blocks(*graph, NOTHING if final else last)
-        follows = not final and len(self._sources) <= tuning.SEARCH * self._searched
-        if isinstance(last, DriveSolution) and follows:
-            return follow(*graph, last) or decide_anew(*graph, last.decision.scales)
+            return solve_measured(*graph, NOTHING if final else last.consensus)
+        is_search = final or len(self._sources) > tuning.SEARCH * self._searched
+        if isinstance(last.consensus, Decision) and not is_search:
+            return add_closures(*graph, last, last.consensus)
         for node in [*self.chain.splits][::-1]:
             self._split(node, False)
-        solution = decide_anew(*graph)
+        solution = solve_drives(*graph)
         while self.splits < tuning.MAX_BREAKS and (better := self._with_break(solution)):
             solution = better
         self._searched = len(self._sources)
-        return solution
+        return replace(solution, trials=[])
 
     def _split(self, node: int, begins: bool) -> None:
         """Begin a session at a node, or end it; closures between it and the one before change."""
@@ -220,13 +218,15 @@ class PoseGraph:
             if row is not None:
                 self._closures[number] = row
 
-    def _with_break(self, before: DriveSolution) -> DriveSolution | None:
+    def _with_break(self, before: Solution) -> Solution | None:
         """Begin a session where closures prove that the robot was carried; None = nowhere."""
+        if (~before.accepted).sum() < tuning.GAIN:
+            return None
         for node in breaks.find(self.chain, before.trials, self._closures)[: tuning.SETS]:
             self._split(node, True)
-            if self._is_likely(before.decision.gain):
-                after = decide_anew(self.chain, self._closures)
-                if self._proves(before, after):
+            if self._is_likely(before.gain):
+                after = solve_drives(self.chain, self._closures)
+                if self._proves(before, after, node):
                     return after
             self._split(node, False)
         return None
@@ -236,26 +236,30 @@ class PoseGraph:
         numbers = events(self.chain, self._closures.query, self._closures.place)
         for scale in tuning.SCALES[1:4:2]:
             scales = np.full(len(self.chain.robots), scale)
-            trial = decide_anew(self.chain, self._closures, scales)
+            trial = solve_drives(self.chain, self._closures, scales)
             sizes = np.bincount(numbers[trial.accepted])
-            if trial.decision.gain >= gain and sizes.sum() - sizes.max(initial=0) >= tuning.GAIN:
+            if trial.gain >= gain and sizes.sum() - sizes.max(initial=0) >= tuning.GAIN:
                 return True
         return False
 
-    def _proves(self, before: DriveSolution, after: DriveSolution) -> bool:
+    def _proves(self, before: Solution, after: Solution, node: int) -> bool:
         """
         Return whether closures prove a break: more of them agree, or with more evidence.
 
         A break explains any false run behind it: the closures of the largest new event do not
         count, and where none agreed before, most have to agree.
         """
-        agreed, agree = before.accepted, after.accepted
-        numbers = events(self.chain, self._closures.query, self._closures.place)
+        agreed, agree, query = before.accepted, after.accepted, self._closures.query
+        sessions = self.chain.session[[self.chain.before(node), node]]
+        sides = (self.chain.session[query[agree], None] == sessions).sum(axis=0)
+        if sides.min() < tuning.SUPPORT or (agreed & ~agree).sum() >= tuning.GAIN:
+            return False
         if not agreed.any() and 2 * agree.sum() <= len(agree):
             return False
+        numbers = events(self.chain, query, self._closures.place)
         is_new = agree & ~np.isin(numbers, numbers[agreed])
         sizes = np.unique(numbers[is_new], return_counts=True)[1]
-        gain = after.decision.gain - before.decision.gain
+        gain = after.gain - before.gain
         if agree.sum() - agreed.sum() - sizes.max(initial=0) >= tuning.GAIN:
             return gain >= 0
         return len(sizes) >= tuning.EVENTS and gain > 2 * tuning.LOOSER

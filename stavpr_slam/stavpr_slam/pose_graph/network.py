@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The graph as factors: solved by least squares, or by graduated non-convexity.
+The graph as factors, solved by least squares.
 
 Few nodes are variables: a run of the odometry between two of them is one factor, and the
 nodes inside a run follow from its ends. Drives in a plane have poses in the plane.
@@ -24,7 +24,12 @@ ANCHOR = 1e-4  # deviation of the pose of the first node, rad and m
 LOOSE_ANGLE, LOOSE_POSITION = 3.0, 1e3  # of a session that nothing joins to the others
 PLANAR = [3, 4, 2]  # x, y and yaw of a twist
 FLAT = 1e-6  # m and rad out of the plane that are none
-NONE = 1e-4  # weight of a closure that does not count
+
+
+def freedom_of(chain: KeyframeChain) -> int:
+    """Return the freedom of poses: 3 where the odometry is in the plane, 6 elsewhere."""
+    z, tilt = chain.transforms[:, 2, 3], chain.transforms[:, 2, :2]
+    return 3 if np.ptp(z) < FLAT and np.abs(tilt).max() < FLAT else 6
 
 
 def room(nodes: np.ndarray, freedom: int) -> float:
@@ -49,7 +54,8 @@ class Network:
     :param closures: n closures; ``query`` and ``place`` are their nodes, (n,).
     :param links: first node of each session: the node that it is tied to loosely; -1 = it is an
         anchor.
-    :param freedom: of poses, 3 = in the plane, or 6; None = by the odometry.
+    :param freedom: of poses, 3 = in the plane, or 6.
+    :param space: logarithm of the poses of the map, see :func:`room`.
     """
 
     def __init__(
@@ -58,7 +64,8 @@ class Network:
         initial: np.ndarray,
         closures: ClosureArrays,
         links: Mapping[int, int],
-        freedom: int | None = None,
+        freedom: int,
+        space: float,
     ) -> None:
         self._chain, self._links = chain, links
         self.query, self.place = closures.query, closures.place
@@ -66,14 +73,11 @@ class Network:
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
-        z, tilt = chain.transforms[:, 2, 3], chain.transforms[:, 2, :2]
-        is_planar = np.ptp(z) < FLAT and np.abs(tilt).max() < FLAT
-        self.freedom = freedom or (3 if is_planar else 6)
-        at = np.array(PLANAR if self.freedom == 3 else range(6))
+        at = np.array(PLANAR if freedom == 3 else range(6))
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
-        self.room = room(initial, self.freedom)
+        self.freedom, self.room = freedom, space
         self._loose_determinant = float(np.log(loose).sum() / 2)
-        self.limit = float(chi2.ppf(tuning.INLIER, self.freedom))
+        self.limit = float(chi2.ppf(tuning.INLIER, freedom))
         self.information = np.linalg.inv(closures.covariance[:, at[:, None], at])
 
         # a factor for each variable: the odometry before it, a loose link, or an anchor
@@ -140,47 +144,10 @@ class Network:
         none = np.zeros(len(self.query))
         return self.innovations(none, chosen, spread[:, at[:, None], at])
 
-    def new_joins(self, accepted: np.ndarray) -> np.ndarray:
-        """Return which closures join sessions that no accepted one joins, shape (n,), bool."""
-        pairs, key = self._pairs, self._pairs @ [len(self._chain), 1]
-        return (pairs[:, 0] != pairs[:, 1]) & ~np.isin(key, key[accepted])
-
-    def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
-        """Return the node behind the part of the odometry that deviates most, and how much."""
-        deviations = self._solver.linearize(values, odometry)[: len(values)]
-        worst = int(np.argmax(deviations))
-        return int(self._variables[worst]), float(deviations[worst])
-
-    def robust(
-        self, odometry: np.ndarray, values: np.ndarray, start: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Decide which closures are right by graduated non-convexity, truncated least squares.
-
-        As in Yang et al., *Graduated Non-Convexity for Robust Spatial Perception*, RA-L 2020, with
-        a step of Gauss and Newton for each parameter; the odometry is right.
-
-        :param start: first parameter, where the variables are a solution already.
-        :returns: whether each closure is, shape (n,), and the variables.
-        :raises LinAlgError: no solution.
-        """
-        weights, limit = np.ones(len(self.query)), self.limit
-        errors = self.residuals(odometry, values)
-        for _ in range(0 if start else tuning.FIRST_STEPS):
-            values, _ = self._solver.step(values, weights)
-            errors = self.residuals(odometry, values)
-        if 2 * errors.max(initial=0.0) <= limit:
-            return weights > 0, values
-        mu = start or limit / (2 * errors.max() - limit)
-        for _ in range(tuning.MAX_STEPS):
-            surely, never = mu / (mu + 1) * limit, (mu + 1) / mu * limit
-            between = np.sqrt(limit * mu * (mu + 1) / errors.clip(surely)) - mu
-            weights = np.where(errors >= never, 0.0, np.where(errors <= surely, 1.0, between))
-            values, _ = self._solver.step(values, weights * (weights > NONE))
-            if mu > 1 and (np.minimum(weights, 1 - weights) < 1e-3).all():
-                break
-            errors, mu = self.residuals(odometry, values), mu * tuning.GROWTH
-        return weights > 0.5, values
+    def beside(self, chosen: np.ndarray) -> np.ndarray:
+        """Return which closures are between the same sessions as chosen ones, shape (n,), bool."""
+        key = self._pairs @ [len(self._chain), 1]
+        return np.isin(key, key[chosen])
 
     def fit(
         self,

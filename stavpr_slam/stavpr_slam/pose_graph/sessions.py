@@ -24,12 +24,14 @@ class Placement:
     :param links: first node of each session: the node that it is tied to; -1 = it is an anchor.
     :param pairs: sessions that closures may join.
     :param allowed: closures within a session, or of such a pair, shape (n,), bool.
+    :param joins: numbers of the closures that place a session, one each.
     """
 
     initial: np.ndarray
     links: dict[int, int]
     pairs: frozenset[Pair]
     allowed: np.ndarray
+    joins: list[int]
 
 
 def session_pairs(chain: KeyframeChain, closures: ClosureArrays) -> np.ndarray:
@@ -51,7 +53,7 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
     :param denied: pairs of sessions that do not join.
     """
     T, session, Z = chain.transforms, chain.session, closures.transform
-    result, links = T.copy(), {}
+    result, links, chosen = T.copy(), {}, list[int]()
     counts = weights(chain, closures).items()
     joins = {pair for pair, weight in counts if weight >= tuning.JOINS and pair not in denied}
     pairs = session_pairs(chain, closures).tolist()
@@ -64,8 +66,8 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
             waiting[0],
         )
         mine, is_placed, node = session == number, np.isin(session, [*placed]), starts[number]
-        ahead = allowed & mine[closures.query] & is_placed[closures.place]
-        back = allowed & mine[closures.place] & is_placed[closures.query]
+        ahead = np.flatnonzero(allowed & mine[closures.query] & is_placed[closures.place])
+        back = np.flatnonzero(allowed & mine[closures.place] & is_placed[closures.query])
         others = np.concatenate([closures.place[ahead], closures.query[back]])
         if len(others):
             own = np.concatenate([closures.query[ahead], closures.place[back]])
@@ -74,13 +76,14 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
             votes = result[others[thin]] @ motions @ inverse(T[own[thin]])
             best = _best(votes, T[mine])
             result[mine], links[node] = votes[best] @ T[mine], int(others[thin[best]])
+            chosen.append(int(np.append(ahead, back)[thin[best]]))
         else:
             links[node] = link = chain.before(node)
             if link >= 0:
                 result[mine] = result[link] @ inverse(T[node]) @ T[mine]
         waiting.remove(number)
         placed.add(number)
-    return Placement(result, links, frozenset(joins), allowed)
+    return Placement(result, links, frozenset(joins), allowed, chosen)
 
 
 def _best(votes: np.ndarray, transforms: np.ndarray) -> int:

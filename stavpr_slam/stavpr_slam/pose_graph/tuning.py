@@ -20,15 +20,13 @@ PRECISE = TIGHT * TIGHT  # the smallest one of a solution
 CERTAIN = math.log(20)  # evidence of a correction that is published, or of a first closure
 LOOSER = CERTAIN  # that of other errors of the odometry, and of each doubling of the settings'
 GAP = 15.0  # meters between the queries and places of an event, and around a break, at most
-STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
+PARTS = 10  # of a drive that is decided anew, by time
 SEARCH = 1.1  # times the closures of the last search of factors and breaks: it is made anew
 
 # robust solution
 INLIER = 0.99  # part of right closures whose residuals are below the limit
 FIRST_STEPS = 4  # of Gauss and Newton with all closures
 MAX_STEPS = 25  # of Gauss and Newton, and of expectation and maximization
-GROWTH = 2.0  # of the parameter of graduated non-convexity
-AGAIN = 0.01  # that parameter at a solution: residuals of ten deviations count a little
 CONVERGED = 1e-3  # change of the error, half the squared deviations, of a solution
 LONGEST = 10  # keyframes of a run, which is one factor; neighbors of a closure
 SPARE = 1.5  # times the active factors: a pattern of so many is used again

@@ -277,10 +277,9 @@ class PoseGraphNode(ManagedNode):
             self.get_logger().error(f'no update: {snapshot.failure}', throttle_duration_sec=10.0)
         if snapshot.values['accepted_closures']:
             self._lost = ''
-        elif float(snapshot.values['evidence_against_correction']) > 0:
+        elif snapshot.values['rejected_closures']:
             self.get_logger().warning(
-                'the odometry is published: the path by the loop closures is less probable '
-                f'(evidence -{snapshot.values["evidence_against_correction"]})',
+                'the odometry is published: it contradicts all loop closures',
                 throttle_duration_sec=10.0,
             )
         if snapshot.trajectories and self.state == 'active':
@@ -345,8 +344,8 @@ class PoseGraphNode(ManagedNode):
         }
         reason = max(useless, key=lambda text: useless[text])
         level, text = DiagnosticStatus.WARN, f'{graph["accepted_closures"]} closures accepted'
-        if float(self._values.get('evidence_against_correction', 0)) > 0:
-            text = 'the odometry is published: the path by the closures is less probable'
+        if graph['rejected_closures'] and not graph['accepted_closures']:
+            text = 'the odometry is published: it contradicts all closures'
         if self.state != 'active':
             level, text = DiagnosticStatus.OK, f'the node is {self.state}'
         elif self._lost:

@@ -157,7 +157,6 @@ class GraphServer:
             'closures_of_unknown_stamps': graph.counts['unknown stamp'],
             'closures_without_solution': graph.counts['failed'],
             'odometry_error_factor': f'{graph.scale:.2f}',
-            'evidence_against_correction': f'{graph.refused:.1f}',
         }
 
     def _paths(self) -> tuple[dict[str, Trajectory], list[np.ndarray]]:
