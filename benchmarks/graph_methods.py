@@ -293,15 +293,13 @@ METHODS: dict[str, Method] = {
     'GNC (GTSAM, odometry as known inliers)': lambda drive: plain(drive, gnc=True),
     'Cauchy kernel': lambda drive: plain(drive, ESTIMATORS.Cauchy.Create(1.0)),
     'dynamic covariance scaling': lambda drive: plain(drive, ESTIMATORS.DCS.Create(1.0)),
-    'without evidence: each correction is published': lambda drive: ours(
-        drive, tuning, 'CERTAIN', -1e9
-    ),
+    'uncertain closures as well': lambda drive: ours(drive, tuning, 'CERTAIN', 0.0),
     'each closure is an event': lambda drive: ours(drive, tuning, 'GAP', -1.0),
     'a tight odometry only': lambda drive: ours(drive, tuning, 'SCALES', tuning.SCALES[:1]),
     'an odometry of the default errors': lambda drive: ours(drive, tuning, 'TIGHT', 1.0),
-    'without a second robust solution': lambda drive: ours(drive, tuning, 'AGAIN', 1e9),
+    'all closures in one block': lambda drive: ours(drive, tuning, 'PARTS', 1),
     'without breaks': lambda drive: ours(drive, tuning, 'SUPPORT', 10**6),
-    'slower steps of the robust solution': lambda drive: ours(drive, tuning, 'GROWTH', 1.4),
+    'twenty blocks': lambda drive: ours(drive, tuning, 'PARTS', 20),
     'every keyframe a variable': lambda drive: ours(drive, tuning, 'LONGEST', 1),
 }  # fmt: skip
 

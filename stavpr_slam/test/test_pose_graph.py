@@ -253,7 +253,7 @@ def test_update_without_solution_leaves_new_closures_out(drive, monkeypatch):
     graph.update()
     accepted = graph.accepted
     fails = Mock(side_effect=[np.linalg.LinAlgError, graph._solution])
-    monkeypatch.setattr(graph_module, 'add_closures', fails)
+    monkeypatch.setattr(graph_module.solution, 'add_closures', fails)
     graph.add_closure(closures[20])
     graph.update()
     assert graph.counts['failed'] == 1

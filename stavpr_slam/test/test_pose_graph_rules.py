@@ -15,12 +15,9 @@ from stavpr_slam.pose_graph import (
     network,
     optimize,
     PoseGraph,
+    solution,
     tuning,
 )
-from stavpr_slam.pose_graph import (
-    graph as graphs,
-)
-from stavpr_slam.pose_graph.solution import solve_drives
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
 
@@ -227,11 +224,11 @@ def test_carried_robot_without_breaks(monkeypatch):
 
 def test_false_runs_are_tried_at_few_factors(monkeypatch):
     """A break explains each run: a decision at all factors would be of no use."""
-    counting = Mock(wraps=solve_drives)
-    monkeypatch.setattr(graphs, 'solve_drives', counting)
+    counting = Mock(wraps=solution.solve_drives)
+    monkeypatch.setattr(solution, 'solve_drives', counting)
     ratio(*false_drive('long runs'))
     assert [len(call.args) for call in counting.call_args_list].count(2) == 1
-    monkeypatch.setattr(PoseGraph, '_is_likely', lambda *_: True)
+    monkeypatch.setattr(PoseGraph, '_proves', lambda *_: True)
     ratio(*false_drive('long runs'))
     assert [len(call.args) for call in counting.call_args_list].count(2) > 2
 

@@ -138,23 +138,21 @@ class Blocks:
         self._accepted = np.zeros(count, bool)
         self._accepted[:old] = last.inliers & placement.allowed[:old]
         self._beliefs = last.beliefs.resize(space, count)
-        is_enough = count > 0 and count >= tuning.SEARCH * last.beliefs.search_count
-        self._searches = scales is None and is_enough
+        searched = max(1, tuning.SEARCH * last.beliefs.search_count)
+        self._searches = scales is None and count >= searched
         if self._searches:
-            network, _ = self._begin(chain, placement.initial, np.arange(count))
+            self._begin(chain, placement.initial, np.arange(count))
             ends = chain.session[closures.query], chain.session[closures.place]
             inside = np.flatnonzero(ends[0] == ends[1])
-            rows, new = network.beside_odometry(inside), ~self._is_old[inside]
+            rows, new = self.network.beside_odometry(inside), ~self._is_old[inside]
             self._beliefs.innovations[inside[new]] = rows[new]
             factors = tuning.FACTORS / self._beliefs.factor
             self._beliefs = self._beliefs.search_factor(rows, self._runs[inside], factors)
             self._beliefs = replace(self._beliefs, search_count=count)
 
-    def _begin(
-        self, part: KeyframeChain, nodes: np.ndarray, own: np.ndarray
-    ) -> tuple[Network, np.ndarray]:
+    def _begin(self, part: KeyframeChain, nodes: np.ndarray, own: np.ndarray) -> np.ndarray:
         """
-        Begin a block, and return its network, linearized, and the variables.
+        Begin a block with a network, linearized, and return the variables.
 
         :param own: numbers of all closures up to its end.
         """
@@ -171,7 +169,7 @@ class Blocks:
         self._set_odometry()
         values = network.values(nodes)
         network.residuals(self._odometry, values)
-        return network, values
+        return values
 
     def _set_odometry(self) -> None:
         """Set the information of all factors of the network at the present errors."""
@@ -202,7 +200,7 @@ class Blocks:
         :param new: which of them are new, bool.
         :param swaps: leave out weak ones on trial.
         """
-        network, values = self._begin(part, self._nodes, own)
+        values, network = self._begin(part, self._nodes, own), self.network
         accepted, joins = self._accepted[own], np.isin(own, self._placement.joins)
         if (joins & ~accepted).any():  # a session begins where most closures place it
             accepted = accepted | joins

@@ -145,10 +145,9 @@ class Decider:
             best = better(best, trials[-1])
             if all(trial.gain < best.gain - tuning.LOOSER for trial in trials[-2:]):
                 break
-        for robot in range(robots) if robots > 1 else ():
+        for is_own in np.eye(robots, dtype=bool) if robots > 1 else ():
             for scale in tuning.SCALES:
-                other = np.where(np.arange(robots) == robot, scale, best.scales)
-                best = better(best, self.at(other))
+                best = better(best, self.at(np.where(is_own, scale, best.scales)))
         return best, trials
 
     def estimate(

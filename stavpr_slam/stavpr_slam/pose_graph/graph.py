@@ -11,20 +11,13 @@ import numpy as np
 from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import breaks, tuning
+from stavpr_slam.pose_graph import breaks, solution, tuning
 from stavpr_slam.pose_graph.blocks import NOTHING
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
 from stavpr_slam.pose_graph.decision import Decision, events
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extend
-from stavpr_slam.pose_graph.solution import (
-    add_closures,
-    EMPTY,
-    Solution,
-    solve_drives,
-    solve_measured,
-)
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
@@ -72,7 +65,7 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._sources: list[Closure] = []  # those between nodes
         self._closures: ClosureArrays = between_nodes([])  # of them
-        self._solution = EMPTY
+        self._solution = solution.EMPTY
         self._searched = 0  # closures of the last search
         self.counts: Counter[str] = Counter()
 
@@ -189,20 +182,20 @@ class PoseGraph:
             self._solution = self._solve(final)
         return self.solved
 
-    def _solve(self, final: bool) -> Solution:
+    def _solve(self, final: bool) -> solution.Solution:
         last, graph = self._solution, (self.chain, self._closures)
         if self.settings.measured:
-            return solve_measured(*graph, NOTHING if final else last.consensus)
+            return solution.solve_measured(*graph, NOTHING if final else last.consensus)
         is_search = final or len(self._sources) > tuning.SEARCH * self._searched
         if isinstance(last.consensus, Decision) and not is_search:
-            return add_closures(*graph, last, last.consensus)
+            return solution.add_closures(*graph, last, last.consensus)
         for node in [*self.chain.splits][::-1]:
             self._split(node, False)
-        solution = solve_drives(*graph)
-        while self.splits < tuning.MAX_BREAKS and (better := self._with_break(solution)):
-            solution = better
+        best = solution.solve_drives(*graph)
+        while self.splits < tuning.MAX_BREAKS and (better := self._with_break(best)):
+            best = better
         self._searched = len(self._sources)
-        return replace(solution, trials=[])
+        return replace(best, trials=[])
 
     def _split(self, node: int, begins: bool) -> None:
         """Begin a session at a node, or end it; closures between it and the one before change."""
@@ -218,51 +211,39 @@ class PoseGraph:
             if row is not None:
                 self._closures[number] = row
 
-    def _with_break(self, before: Solution) -> Solution | None:
+    def _with_break(self, before: solution.Solution) -> solution.Solution | None:
         """Begin a session where closures prove that the robot was carried; None = nowhere."""
         if (~before.accepted).sum() < tuning.GAIN:
             return None
+        graph, robots = (self.chain, self._closures), len(self.chain.robots)
+        factors = [np.full(robots, scale) for scale in tuning.SCALES[1:4:2]]
         for node in breaks.find(self.chain, before.trials, self._closures)[: tuning.SETS]:
             self._split(node, True)
-            if self._is_likely(before.gain):
-                after = solve_drives(self.chain, self._closures)
+            # two factors show whether a search of all is of use
+            trials = (solution.solve_drives(*graph, scales) for scales in factors)
+            if any(self._proves(before, trial, node) for trial in trials):
+                after = solution.solve_drives(*graph)
                 if self._proves(before, after, node):
                     return after
             self._split(node, False)
         return None
 
-    def _is_likely(self, gain: float) -> bool:
-        """Return whether closures of several events agree, with as much gain, at two factors."""
-        numbers = events(self.chain, self._closures.query, self._closures.place)
-        for scale in tuning.SCALES[1:4:2]:
-            scales = np.full(len(self.chain.robots), scale)
-            trial = solve_drives(self.chain, self._closures, scales)
-            sizes = np.bincount(numbers[trial.accepted])
-            if trial.gain >= gain and sizes.sum() - sizes.max(initial=0) >= tuning.GAIN:
-                return True
-        return False
-
-    def _proves(self, before: Solution, after: Solution, node: int) -> bool:
+    def _proves(self, before: solution.Solution, after: solution.Solution, node: int) -> bool:
         """
-        Return whether closures prove a break: more of them agree, or with more evidence.
+        Return whether closures prove a break: more of them agree, with as much evidence.
 
-        A break explains any false run behind it: the closures of the largest new event do not
-        count, and where none agreed before, most have to agree.
+        A break explains any false run behind it: closures on both sides agree, and nearly all that
+        agreed before; those of the largest new event do not count.
         """
         agreed, agree, query = before.accepted, after.accepted, self._closures.query
         sessions = self.chain.session[[self.chain.before(node), node]]
         sides = (self.chain.session[query[agree], None] == sessions).sum(axis=0)
         if sides.min() < tuning.SUPPORT or (agreed & ~agree).sum() >= tuning.GAIN:
             return False
-        if not agreed.any() and 2 * agree.sum() <= len(agree):
-            return False
         numbers = events(self.chain, query, self._closures.place)
-        is_new = agree & ~np.isin(numbers, numbers[agreed])
-        sizes = np.unique(numbers[is_new], return_counts=True)[1]
-        gain = after.gain - before.gain
-        if agree.sum() - agreed.sum() - sizes.max(initial=0) >= tuning.GAIN:
-            return gain >= 0
-        return len(sizes) >= tuning.EVENTS and gain > 2 * tuning.LOOSER
+        sizes = np.bincount(numbers[agree & ~np.isin(numbers, numbers[agreed])])
+        more = agree.sum() - agreed.sum() - sizes.max(initial=0)
+        return bool(more >= tuning.GAIN and after.gain >= before.gain)
 
     # results
 

@@ -38,8 +38,7 @@ AGREEING = 0.25  # part of the closures between sessions that agree at least
 SAMPLE = 100  # closures between sessions that vote, and poses that they move, at most
 
 # breaks of the odometry: the robot was carried
-GAIN = 24  # closures more that agree if there is a break, beside the largest new event, or
-EVENTS = 3  # new events, of two times the evidence of other errors of the odometry
+GAIN = 24  # closures more that agree if there is a break, beside the largest new event
 SUPPORT = 32  # closures on each side of a break
 SPREAD = 2.0  # meters, and deviations of two closures, that agreeing ones are apart
 PAUSE = 1.5  # times the usual time between keyframes: the robot was carried then

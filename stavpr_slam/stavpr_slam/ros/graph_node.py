@@ -41,6 +41,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 PERIOD = 1.0  # seconds between two diagnostics
+CONTRADICTED = 'the odometry is published: it contradicts all closures'
 UNUSABLE = {  # counts of closures without a measurement, by the source of the relative pose
     RelativePose.REFUTED: 'refuted closures',
     RelativePose.DROPPED: 'dropped closures',
@@ -278,10 +279,7 @@ class PoseGraphNode(ManagedNode):
         if snapshot.values['accepted_closures']:
             self._lost = ''
         elif snapshot.values['rejected_closures']:
-            self.get_logger().warning(
-                'the odometry is published: it contradicts all loop closures',
-                throttle_duration_sec=10.0,
-            )
+            self.get_logger().warning(CONTRADICTED, throttle_duration_sec=10.0)
         if snapshot.trajectories and self.state == 'active':
             for robot, (stamps, *both) in snapshot.trajectories.items():
                 for publisher, poses in zip(self._paths[robot], both, strict=True):
@@ -345,7 +343,7 @@ class PoseGraphNode(ManagedNode):
         reason = max(useless, key=lambda text: useless[text])
         level, text = DiagnosticStatus.WARN, f'{graph["accepted_closures"]} closures accepted'
         if graph['rejected_closures'] and not graph['accepted_closures']:
-            text = 'the odometry is published: it contradicts all closures'
+            text = CONTRADICTED
         if self.state != 'active':
             level, text = DiagnosticStatus.OK, f'the node is {self.state}'
         elif self._lost:
