@@ -14,14 +14,14 @@ import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
-    'lines of stavpr_ros': 30_903,
+    'lines of stavpr_ros': 30_885,
     'lines of stavpr_fleet': 1_199,
-    'lines of stavpr_slam': 4_483,
+    'lines of stavpr_slam': 4_299,
     'lines of stavpr_nav': 1_622,
-    'lines of stavpr_lab': 12_191,
+    'lines of stavpr_lab': 12_190,
     'lines of the method (prepare, method)': 5_642,
-    'lines of all tests': 33_524,
-    'lines of benchmarks and tools': 9_254,
+    'lines of all tests': 33_648,
+    'lines of benchmarks and tools': 9_250,
     'lines of docs and README': 3_300,
     'parameters of the node': 51,
     'numbers in constants of the method': 147,

@@ -17,15 +17,16 @@ import numpy as np
 SCALES = np.exp2(np.arange(-3, 3))  # factors on the errors of the odometry: 1/8 to 4
 TIGHT = float(SCALES[0])  # the one that it is trusted by at first
 PRECISE = TIGHT * TIGHT  # the smallest one of a solution
-CERTAIN = math.log(20)  # evidence of a correction that is published, or of a first closure
+CERTAIN = math.log(20)  # odds of a closure that is accepted, and evidence of a factor
 LOOSER = CERTAIN  # that of other errors of the odometry, and of each doubling of the settings'
 GAP = 15.0  # meters between the queries and places of an event, and around a break, at most
-PARTS = 10  # of a drive that is decided anew, by time
+PARTS = 10  # blocks of a drive that is decided anew, by time
 SEARCH = 1.1  # times the closures of the last search of factors and breaks: it is made anew
 
-# robust solution
+# closures, in blocks by time
+TAILS = 4.0  # times the limit of a chi-square: errors have long tails
 INLIER = 0.99  # part of right closures whose residuals are below the limit
-FIRST_STEPS = 4  # of Gauss and Newton with all closures
+FIRST_STEPS = 4  # of Gauss and Newton with all closures that may be right
 MAX_STEPS = 25  # of Gauss and Newton, and of expectation and maximization
 CONVERGED = 1e-3  # change of the error, half the squared deviations, of a solution
 LONGEST = 10  # keyframes of a run, which is one factor; neighbors of a closure
@@ -46,9 +47,8 @@ SETS = 2  # of closures that agree on another path
 COMPARED = 1500  # rejected closures of a session, evenly: 50 MB
 MAX_BREAKS = 4  # that are searched
 
-# graphs of other programs, in blocks by time
-BLOCKS = 20  # of a graph that comes at once
-TAILS = 4.0  # times the limit of a chi-square: errors have long tails
+# graphs of other programs
+BLOCKS = 20  # of a graph that comes at once, by time
 WEAKEST = 12  # closures that are left out on trial
 PLAUSIBLE = 50  # rejected closures that are tried in their place
 FACTORS = np.exp2(np.arange(-13, 5, 0.5))  # on the errors that a file states
