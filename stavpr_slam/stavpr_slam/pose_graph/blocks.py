@@ -206,7 +206,7 @@ class Blocks:
             accepted = accepted | joins
             values, _ = network.fit(self._odometry, accepted, values)
             network.residuals(self._odometry, values)
-            new = (new | network.beside(joins)) & ~accepted
+            new = (new | network.are_across) & ~accepted
         for again in PASSES:
             rows = self._beliefs.innovations[own]
             if again:

@@ -51,7 +51,8 @@ class Network:
     Values of the variables are transforms, shape (V, 4, 4).
 
     :param initial: transforms of all nodes, shape (N, 4, 4).
-    :param closures: n closures; ``query`` and ``place`` are their nodes, (n,).
+    :param closures: n closures; ``query`` and ``place`` are their nodes, (n,), and
+        ``are_across`` whether they are in two sessions, (n,), bool.
     :param links: first node of each session: the node that it is tied to loosely; -1 = it is an
         anchor.
     :param freedom: of poses, 3 = in the plane, or 6.
@@ -70,6 +71,7 @@ class Network:
         self._chain, self._links = chain, links
         self.query, self.place = closures.query, closures.place
         self._pairs = session_pairs(chain, closures)
+        self.are_across = self._pairs[:, 0] != self._pairs[:, 1]
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
@@ -143,11 +145,6 @@ class Network:
         spread, at = self._chain.path_errors(self.query[chosen], self.place[chosen]), self._at
         none = np.zeros(len(self.query))
         return self.innovations(none, chosen, spread[:, at[:, None], at])
-
-    def beside(self, chosen: np.ndarray) -> np.ndarray:
-        """Return which closures are between the same sessions as chosen ones, shape (n,), bool."""
-        key = self._pairs @ [len(self._chain), 1]
-        return np.isin(key, key[chosen])
 
     def fit(
         self,
