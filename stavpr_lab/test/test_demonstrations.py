@@ -333,7 +333,7 @@ def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(lesson, tmp_pa
     assert (tmp_path / 'repeat.webp').stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(('seed', 'seconds', 'meters'), [(11, 4, 8), (13, 1, 1.2)])
+@pytest.mark.parametrize(('seed', 'seconds', 'meters'), [(11, 4.5, 8), (13, 1, 1.2)])
 def test_robot_stops_where_the_camera_shows_another_route(lesson, seed, seconds, meters):
     """Street 11 has the same cars as the taught one, at the same places."""
     world = RingWorld(seed)

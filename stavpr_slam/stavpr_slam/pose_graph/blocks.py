@@ -190,6 +190,8 @@ class Blocks:
                 swaps = is_last and is_whole and self._scales is None
                 self._decide(part, np.flatnonzero(usable), ~seen[usable], swaps)
             seen |= usable
+        if self._scales is not None and is_whole:  # what a later block has corrected may agree
+            self._decide(part, self.own, ~self._accepted[self.own], False)
         return Consensus(self._nodes, self._accepted, self._beliefs)
 
     def _decide(self, part: KeyframeChain, own: np.ndarray, new: np.ndarray, swaps: bool) -> None:
