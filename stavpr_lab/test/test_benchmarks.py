@@ -129,7 +129,7 @@ def test_program_prints_its_help(name):
 
 @pytest.mark.parametrize('page', [ROOT / 'Makefile', *PAGES], ids=lambda page: page.name)
 def test_page_names_programs_and_options_that_there_are(page):
-    """The options of a line are those of its programs, and of those that its targets run."""
+    """Each option of a line is one of its programs, or of programs that its targets run."""
     for line in page.read_text().splitlines():
         assert {*re.findall(r'benchmarks/(\w+)\.py', line)} <= {*PROGRAMS}, line
         names = {*re.findall(r'(?<![\w/])(?:benchmarks/)?(\w+)\.py', line)} & {*PROGRAMS}

@@ -233,7 +233,7 @@ class PoseGraph:
         Return whether closures prove a break: more of them agree, with as much evidence.
 
         A break explains any false run behind it: closures on both sides agree, and nearly all that
-        agreed before; those of the largest new event do not count.
+        agreed before; closures of the largest new event do not count.
         """
         agreed, agree, query = before.accepted, after.accepted, self._closures.query
         sessions = self.chain.session[[self.chain.before(node), node]]
